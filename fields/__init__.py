@@ -1,0 +1,51 @@
+"""Neural fields over body geometry.
+
+Every public name can be imported from here or from its room; the rooms load on first use, so
+importing this package costs nothing and has no effects.
+"""
+
+if __name__ != "monopart.fields":  # a bare import would copy every class
+    raise ImportError(f"import monopart.fields, not {__name__!r}")
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .distance_prior import DistancePrior as DistancePrior
+    from .frequency import FrequencyEncoding as FrequencyEncoding
+    from .hash_grid import GridSpec as GridSpec
+    from .hash_grid import HashGrid as HashGrid
+    from .mlp import PartMLP as PartMLP
+    from .occupancy import PartOccupancy as PartOccupancy
+    from .part_field import PartField as PartField
+    from .part_field import PartFieldSpec as PartFieldSpec
+    from .part_union import Union as Union
+    from .part_union import union_by_density as union_by_density
+    from .residual import ResidualField as ResidualField
+    from .volume import composite as composite
+
+_ROOM = {
+    "DistancePrior": "distance_prior",
+    "FrequencyEncoding": "frequency",
+    "GridSpec": "hash_grid",
+    "HashGrid": "hash_grid",
+    "PartField": "part_field",
+    "PartFieldSpec": "part_field",
+    "PartMLP": "mlp",
+    "PartOccupancy": "occupancy",
+    "ResidualField": "residual",
+    "Union": "part_union",
+    "composite": "volume",
+    "union_by_density": "part_union",
+}
+__all__ = list(_ROOM)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _ROOM:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_ROOM[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_ROOM})

@@ -1,0 +1,1 @@
+"""monopart.fields.kernels."""

@@ -1,0 +1,115 @@
+"""Differentiable body geometry, importable alone.
+
+Every public name can be imported from here or from its room; the rooms load on first use, so
+importing this package costs nothing and has no effects. Two names are those of rooms and stay
+rooms here: take the functions with ``from monopart.geometry.rigid import rigid`` and
+``from monopart.geometry.skinning import unskin``.
+"""
+
+if __name__ != "monopart.geometry":  # a bare import would copy every class
+    raise ImportError(f"import monopart.geometry, not {__name__!r}")
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .body import BodyModel as BodyModel
+    from .body import BodyPose as BodyPose
+    from .body import PosedBody as PosedBody
+    from .body import convert_smplx_translation as convert_smplx_translation
+    from .body_io import read_body_arrays as read_body_arrays
+    from .body_io import read_npy_object as read_npy_object
+    from .boxes import box_mask as box_mask
+    from .boxes import box_of as box_of
+    from .boxes import in_box as in_box
+    from .boxes import ray_box as ray_box
+    from .cameras import Camera as Camera
+    from .cameras import Rays as Rays
+    from .cameras import orbit_cameras as orbit_cameras
+    from .consistency import consistency_loss as consistency_loss
+    from .consistency import round_trip as round_trip
+    from .culling import BodyShell as BodyShell
+    from .culling import ShellSamples as ShellSamples
+    from .errors import BackendError as BackendError
+    from .errors import InputError as InputError
+    from .errors import MonopartError as MonopartError
+    from .kinematics import KinematicTree as KinematicTree
+    from .kinematics import forward_kinematics as forward_kinematics
+    from .parts import PartMap as PartMap
+    from .posed_parts import PartPairs as PartPairs
+    from .posed_parts import PosedParts as PosedParts
+    from .posed_parts import RestPoints as RestPoints
+    from .rigid import invert_affine as invert_affine
+    from .rigid import transform_points as transform_points
+    from .rotations import axis_angle_to_rotmat as axis_angle_to_rotmat
+    from .rotations import quat_wxyz_to_rotmat as quat_wxyz_to_rotmat
+    from .rotations import rotation_angle as rotation_angle
+    from .rotations import rotmat_to_axis_angle as rotmat_to_axis_angle
+    from .rotations import rotmat_to_quat_wxyz as rotmat_to_quat_wxyz
+    from .skinning import blend_transforms as blend_transforms
+    from .skinning import skin as skin
+    from .surface import SurfaceHit as SurfaceHit
+    from .surface import SurfaceIndex as SurfaceIndex
+    from .surface import closest_point as closest_point
+    from .surface import signed_distance as signed_distance
+    from .surface import vertex_normals as vertex_normals
+    from .unskin import Unskinned as Unskinned
+    from .unskin import inverse_skin as inverse_skin
+    from .uv import UVMap as UVMap
+
+_ROOM = {
+    "BackendError": "errors",
+    "BodyModel": "body",
+    "BodyPose": "body",
+    "BodyShell": "culling",
+    "Camera": "cameras",
+    "InputError": "errors",
+    "KinematicTree": "kinematics",
+    "MonopartError": "errors",
+    "PartMap": "parts",
+    "PartPairs": "posed_parts",
+    "PosedBody": "body",
+    "PosedParts": "posed_parts",
+    "Rays": "cameras",
+    "RestPoints": "posed_parts",
+    "ShellSamples": "culling",
+    "SurfaceHit": "surface",
+    "SurfaceIndex": "surface",
+    "UVMap": "uv",
+    "Unskinned": "unskin",
+    "axis_angle_to_rotmat": "rotations",
+    "blend_transforms": "skinning",
+    "box_mask": "boxes",
+    "box_of": "boxes",
+    "closest_point": "surface",
+    "consistency_loss": "consistency",
+    "convert_smplx_translation": "body",
+    "forward_kinematics": "kinematics",
+    "in_box": "boxes",
+    "inverse_skin": "unskin",
+    "invert_affine": "rigid",
+    "orbit_cameras": "cameras",
+    "quat_wxyz_to_rotmat": "rotations",
+    "ray_box": "boxes",
+    "read_body_arrays": "body_io",
+    "read_npy_object": "body_io",
+    "rotation_angle": "rotations",
+    "rotmat_to_axis_angle": "rotations",
+    "rotmat_to_quat_wxyz": "rotations",
+    "round_trip": "consistency",
+    "signed_distance": "surface",
+    "skin": "skinning",
+    "transform_points": "rigid",
+    "vertex_normals": "surface",
+}
+__all__ = list(_ROOM)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _ROOM:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_ROOM[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_ROOM})

@@ -1,0 +1,1 @@
+"""monopart.geometry.kernels."""

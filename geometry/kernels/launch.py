@@ -1,0 +1,142 @@
+"""Warp launches over torch tensors: the only file that knows threads, streams and interop.
+
+A Warp kernel runs on one thread on the CPU and releases the GIL, so a launch over ``count`` items is cut into
+chunks for a small pool. Kernels that are launched here take ``start: int`` as their first argument and work on
+item ``start + wp.tid()``. On CUDA one launch goes to torch's current stream, with no host synchronisation.
+"""
+
+import functools
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+_SMALL = 1024  # below this many items a second thread costs more than it saves
+_LOCK = threading.Lock()
+_READY: list[bool] = []
+_COMPILED: set[Any] = set()  # kernels whose module is loaded for the CPU
+
+_VECTOR = {
+    (torch.float32, 1): wp.float32,
+    (torch.float32, 2): wp.vec2,
+    (torch.float32, 3): wp.vec3,
+    (torch.float32, 4): wp.vec4,
+    (torch.int32, 3): wp.vec3i,
+}
+_SCALAR = {
+    torch.float32: wp.float32,
+    torch.float64: wp.float64,
+    torch.int32: wp.int32,
+    torch.int64: wp.int64,
+    torch.uint8: wp.uint8,
+    torch.bool: wp.bool,
+}
+
+
+def view(tensor: Tensor, vector: int = 1) -> Any:
+    """Warp's view of a contiguous tensor without a copy.
+
+    Args:
+        tensor: contiguous; float32, float64, int32, int64, uint8 or bool.
+        vector: 2, 3 or 4 reads the last axis as one vector (float32 only); 1 keeps scalars.
+
+    Returns:
+        A launch argument: an array of the remaining axes.
+    """
+    init()
+    dtype = _VECTOR[tensor.dtype, vector] if vector > 1 else _SCALAR[tensor.dtype]
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="warp")
+
+
+def init() -> None:
+    """Start Warp once, without its banner."""
+    if _READY:
+        return
+    with _LOCK:
+        wp.config.log_level = wp.LOG_ERROR  # no banner, no word about a missing CUDA driver
+        wp.init()
+        wp.config.log_level = wp.LOG_WARNING
+        _READY.append(True)
+
+
+def launch(
+    kernel: Any, count: int, args: list[Any], like: Tensor, smallest: int = _SMALL
+) -> None:
+    """Run ``kernel`` over ``count`` items on the device of ``like``.
+
+    Args:
+        kernel: a Warp kernel whose first argument is ``start: int``.
+        count: number of items; 0 does nothing.
+        args: the arguments after ``start``; tensors go through :func:`view` first.
+        like: any tensor of the launch; tells the device.
+        smallest: fewer items than this stay on one thread.
+    """
+    if count == 0:
+        return
+    init()
+    if like.device.type == "cuda":
+        stream = wp.stream_from_torch(torch.cuda.current_stream(like.device))
+        wp.launch(kernel, dim=count, inputs=[0, *args], stream=stream)
+        return
+    threads = torch.get_num_threads()
+    if threads == 1 or count < smallest:
+        wp.launch(kernel, dim=count, inputs=[0, *args], device="cpu")
+        return
+    cuts = [count * i // threads for i in range(threads + 1)]
+    _run_side_by_side(
+        kernel, [(b - a, [a, *args]) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+    )
+
+
+def _run_side_by_side(kernel: Any, jobs: list[tuple[int, list[Any]]]) -> None:
+    """Run CPU launches on the pool; the first ever runs alone, so that it compiles once."""
+    if kernel not in _COMPILED:
+        dim, inputs = jobs[0]
+        wp.launch(kernel, dim=dim, inputs=inputs, device="cpu", record_tape=False)
+        _COMPILED.add(kernel)
+        jobs = jobs[1:]
+    pool = _pool(torch.get_num_threads())
+    futures = [
+        pool.submit(wp.launch, kernel, dim=dim, inputs=inputs, device="cpu", record_tape=False)
+        for dim, inputs in jobs
+    ]
+    for future in futures:
+        future.result()
+
+
+def launch_jobs(kernel: Any, jobs: list[list[Any]], count: int, like: Tensor) -> None:
+    """Run one launch of ``count`` items per argument list, side by side on the CPU.
+
+    The jobs must write to disjoint memory: this is how scatter kernels stay deterministic without atomics.
+
+    Args:
+        kernel: a Warp kernel whose first argument is ``start: int``.
+        jobs: one argument list (after ``start``) per launch.
+        count: items of each launch.
+        like: any tensor of the launch; tells the device.
+    """
+    if count == 0:
+        return
+    init()
+    if like.device.type == "cuda" or torch.get_num_threads() == 1:
+        for args in jobs:
+            launch_one(kernel, count, args, like)
+        return
+    _run_side_by_side(kernel, [(count, [0, *args]) for args in jobs])
+
+
+def launch_one(kernel: Any, count: int, args: list[Any], like: Tensor) -> None:
+    """Run one unsplit launch (a scatter kernel on one thread, or anything on CUDA)."""
+    if like.device.type == "cuda":
+        stream = wp.stream_from_torch(torch.cuda.current_stream(like.device))
+        wp.launch(kernel, dim=count, inputs=[0, *args], stream=stream)
+    else:
+        wp.launch(kernel, dim=count, inputs=[0, *args], device="cpu")

@@ -1,0 +1,242 @@
+"""The parts of many posed bodies, ready to be asked: samples -> (sample, part) pairs -> rest.
+
+This is the hot path of a part-based method as three calls that another method can use alone:
+``shell.sample`` (rays to samples), ``pairs`` (closest surface of each part within its radius) and ``unskin``
+(canonical point and UV of each pair). Nothing here is differentiable: poses are constants.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from .body import BodyModel, PosedBody
+from .culling import BodyShell, ShellSamples
+from .errors import InputError
+from .parts import PartMap
+from .rigid import append_last_row, invert_affine, transform_points
+from .skinning import blend_transforms
+
+
+@dataclass(frozen=True)
+class PartPairs:
+    """(sample, part) pairs sorted by part: each part owns one slice.
+
+    Attributes:
+        sample: [M] int64 row of the sample.
+        part: [M] int64 part.
+        face: [M] int64 closest face of that part, an index into the faces of the body.
+        bary: [M, 2] first two barycentrics on it.
+        counts: pairs of each part.
+    """
+
+    sample: Int[Tensor, "m"]
+    part: Int[Tensor, "m"]
+    face: Int[Tensor, "m"]
+    bary: Float[Tensor, "m 2"]
+    counts: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class RestPoints:
+    """Where pairs lie in canonical space.
+
+    Attributes:
+        points: [M, 3] canonical points, metres.
+        uv: [M, 2] UV of the closest surface point, interpolated inside its face.
+        valid: [M] False where the blended transform has no inverse (det <= 1e-2).
+    """
+
+    points: Float[Tensor, "m 3"]
+    uv: Float[Tensor, "m 2"]
+    valid: Bool[Tensor, "m"]
+
+
+@dataclass(frozen=True)
+class PartHit:
+    """Closest points on given parts of the only body of a :class:`PosedParts`.
+
+    Attributes:
+        face: [M] int64 face of the body.
+        bary: [M, 3] barycentrics.
+        uv: [M, 2] UV there.
+        found: [M] False beyond the search radius.
+    """
+
+    face: Int[Tensor, "m"]
+    bary: Float[Tensor, "m 3"]
+    uv: Float[Tensor, "m 2"]
+    found: Bool[Tensor, "m"]
+
+
+def _rows(transforms: Tensor) -> Tensor:
+    """The upper three rows of affine maps, as [N, 3, 4], contiguous."""
+    return transforms[..., :3, :].reshape(-1, 3, 4).contiguous()
+
+
+class PosedParts:
+    """Search structures of the parts of one or many posed bodies, and the maps to canonical space."""
+
+    def __init__(
+        self,
+        body: BodyModel,
+        posed: PosedBody,
+        canonical: PosedBody,
+        parts: PartMap,
+        radius: float | Float[Tensor, "k"] = 0.05,
+    ) -> None:
+        """Build shells, search trees and blended maps.
+
+        Args:
+            body: the body model; its UVs must exist.
+            posed: the bodies, batched [B] or single, local pose space, metres.
+            canonical: one body in the canonical pose.
+            parts: the part of each joint.
+            radius: metres; a point farther than this from a part's surface does not belong to it.
+
+        Raises:
+            InputError: the body has no UVs.
+        """
+        if body.uv is None:
+            raise InputError("body: expected UV coordinates, found none; unwrap the body first")
+        verts = posed.verts.detach().reshape(-1, body.num_verts, 3).float().contiguous()
+        self.verts, self.device = verts, verts.device
+        self.faces = body.faces.to(verts.device)
+        self.face_part = parts.face_parts(body.weights, body.faces).to(verts.device)
+        self.num_parts = len(parts.names)
+        radii = torch.as_tensor(radius, dtype=torch.float32, device=verts.device)
+        self.radius = radii.expand(self.num_parts).contiguous()
+        self.shell = BodyShell(verts, self.faces, self.radius, self.face_part)
+        self.corner_uv = body.uv.corner_uv.to(verts).contiguous()
+        weights = body.weights.to(verts)
+        flat = posed.transforms.detach().reshape(-1, body.num_joints, 4, 4).to(verts)
+        self.posed_maps = _rows(blend_transforms(flat, weights))
+        self.canonical_maps = _rows(blend_transforms(canonical.transforms.to(verts), weights))
+        self._faces32 = self.faces.int().contiguous()
+        self._build_trees()
+
+    def _build_trees(self) -> None:
+        from .kernels.closest import mesh
+        from .kernels.launch import init
+
+        init()
+        order = torch.argsort(self.face_part, stable=True)
+        counts = torch.bincount(self.face_part, minlength=self.num_parts)
+        self._order = order
+        self._first = (counts.cumsum(0) - counts).tolist()
+        slices = self._faces32[order].split(counts.tolist())
+        self._trees = [
+            [mesh(verts, tris.contiguous()) if len(tris) else None for tris in slices]
+            for verts in self.verts
+        ]
+        ids = [[tree.id if tree is not None else 0 for tree in row] for row in self._trees]
+        self._ids = torch.tensor(ids, dtype=torch.int64, device=self.device)
+
+    def pairs(self, samples: ShellSamples) -> PartPairs:
+        """Every (sample, part) whose part surface is within that part's radius.
+
+        Args:
+            samples: from ``self.shell.sample``.
+
+        Returns:
+            The pairs, sorted by part, then by sample.
+        """
+        from .kernels.closest import closest_on_parts
+        from .kernels.launch import launch, view
+
+        count = samples.points.shape[0]
+        face = torch.zeros(self.num_parts, count, dtype=torch.int32, device=self.device)
+        bary = torch.zeros(self.num_parts, count, 2, device=self.device)
+        args = [view(self._ids), view(samples.points, 3), view(samples.body)]
+        args += [view(samples.candidates), view(self.radius), view(face), view(bary, 2)]
+        launch(closest_on_parts, count, args, samples.points)
+        part, sample = torch.nonzero(face >= 0, as_tuple=True)
+        first = torch.tensor(self._first, device=self.device)
+        found = self._order[first[part] + face[part, sample].long()]
+        counts = torch.bincount(part, minlength=self.num_parts).tolist()
+        return PartPairs(sample, part, found, bary[part, sample], tuple(counts))
+
+    def unskin(self, samples: ShellSamples, pairs: PartPairs) -> RestPoints:
+        """Canonical point B(w) A(w)^-1 p and UV of each pair (MonoPartNeRF, eq. 1, rigid term).
+
+        Args:
+            samples: the samples that the pairs index.
+            pairs: from :meth:`pairs`.
+
+        Returns:
+            Canonical points in metres, UVs, and where the inverse exists.
+        """
+        from .kernels.closest import unskin_pairs
+        from .kernels.launch import launch, view
+
+        count = pairs.sample.shape[0]
+        points = torch.zeros(count, 3, device=self.device)
+        uv = torch.zeros(count, 2, device=self.device)
+        valid = torch.zeros(count, dtype=torch.bool, device=self.device)
+        args = [view(pairs.sample), view(samples.points, 3), view(samples.body)]
+        args += [view(pairs.face), view(pairs.bary, 2), view(self._faces32, 3)]
+        args += [view(self.corner_uv, 2), view(self.posed_maps, 4), view(self.canonical_maps, 4)]
+        args += [self.verts.shape[1], 1e-2, view(points, 3), view(uv, 2), view(valid)]
+        launch(unskin_pairs, count, args, samples.points)
+        return RestPoints(points, uv, valid)
+
+    def on_part(
+        self, points: Float[Tensor, "m 3"], part: Int[Tensor, "m"], reach: float = 0.2
+    ) -> PartHit:
+        """Closest surface of one given part to each point, on the first body.
+
+        Args:
+            points: positions in the frame of the body, metres.
+            part: part of each point.
+            reach: search radius, metres.
+        """
+        from .kernels.closest import closest_on_parts
+        from .kernels.launch import launch, view
+
+        count = points.shape[0]
+        queries = points.detach().float().contiguous()
+        face = torch.zeros(self.num_parts, count, dtype=torch.int32, device=self.device)
+        bary = torch.zeros(self.num_parts, count, 2, device=self.device)
+        body = torch.zeros(count, dtype=torch.int32, device=self.device)
+        bits = (1 << part).int()
+        radius = torch.full_like(self.radius, reach)
+        args = [view(self._ids), view(queries, 3), view(body), view(bits), view(radius)]
+        launch(closest_on_parts, count, [*args, view(face), view(bary, 2)], queries)
+        rows = torch.arange(count, device=self.device)
+        local = face[part, rows]
+        found = local >= 0
+        first = torch.tensor(self._first, device=self.device)
+        index = self._order[first[part] + local.clamp(min=0).long()]
+        two = bary[part, rows]
+        full = torch.cat([two, 1.0 - two.sum(-1, keepdim=True)], -1)
+        uv = (full[..., None] * self.corner_uv[index]).sum(-2)
+        return PartHit(index, full, uv, found)
+
+    def reskin(
+        self,
+        points: Float[Tensor, "m 3"],
+        body: Int[Tensor, "m"],
+        hit: PartHit,
+        canonical: "PosedParts",
+    ) -> Float[Tensor, "m 3"]:
+        """Canonical points in pose space: A(w') B(w')^-1 c with the weights of a canonical hit.
+
+        Args:
+            points: canonical points, metres.
+            body: body of each point.
+            hit: their closest points on the canonical body.
+            canonical: the canonical body, from which ``hit`` came.
+
+        Returns:
+            Posed points, metres; differentiable in points (the hit is held, as in eq. 2).
+        """
+        corners = self.faces[hit.face]
+        away = _blend(canonical.canonical_maps, corners, hit.bary)
+        there = _blend(self.posed_maps, corners + body[:, None] * self.verts.shape[1], hit.bary)
+        inverse, _ = invert_affine(append_last_row(away))
+        return transform_points(append_last_row(there), transform_points(inverse, points))
+
+
+def _blend(maps: Tensor, corners: Tensor, bary: Tensor) -> Tensor:
+    return (maps[corners] * bary[..., None, None]).sum(1)

@@ -1,0 +1,50 @@
+"""Captures: folders of images, masks, cameras and body poses, read into records."""
+
+from pathlib import Path
+
+from monopart.geometry.errors import InputError
+
+from .checks import CaptureCheck, check_capture, describe
+from .records import CaptureRecord, Frame, Progress, Split
+from .zju_mocap import read_zju_mocap
+
+__all__ = [
+    "CaptureCheck",
+    "CaptureRecord",
+    "Frame",
+    "Progress",
+    "Split",
+    "check_capture",
+    "describe",
+    "read_capture",
+    "read_zju_mocap",
+]
+
+
+def read_capture(
+    path: str | Path, params: str | None = None, body: str | Path | None = None
+) -> CaptureRecord:
+    """Read a capture in any layout that is known; today that of ZJU-MoCap.
+
+    Args:
+        path: folder of the capture.
+        params: folder of the body track inside it, where it is not the layout's own.
+        body: body file that the poses belong to, where it is not the capture's own.
+
+    Returns:
+        The record, in house conventions (metres, pixel centres at +½).
+
+    Raises:
+        InputError: no folder, no layout that is known, or a fault in the capture.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        found = "a file" if root.exists() else "nothing"
+        raise InputError(f"{root}: expected the folder of a capture, found {found}; check the path")
+    if (root / "annots.npy").is_file():
+        return read_zju_mocap(root, params, body)
+    inside = ", ".join(sorted(p.name for p in root.iterdir())[:6]) or "nothing"
+    raise InputError(
+        f"{root}: expected annots.npy (ZJU-MoCap layout: annots.npy, images, mask, new_params), "
+        f"found {inside}; name the folder that holds annots.npy"
+    )

@@ -1,0 +1,83 @@
+"""Training batches: random pixels near the person over all frames, and square patches."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class PixelBatch:
+    """Pixels of training images.
+
+    Attributes:
+        image: [N] int64 row of the training image.
+        pixels: [N, 2] pixel centres (x, y).
+        color: [N, 3] sRGB in [0, 1], black where the mask is off.
+        mask: [N] whether the person covers the pixel.
+    """
+
+    image: Int[Tensor, "n"]
+    pixels: Float[Tensor, "n 2"]
+    color: Float[Tensor, "n 3"]
+    mask: Bool[Tensor, "n"]
+
+
+class PixelSampler:
+    """Draws pixels from the masks grown by a band, each equally likely over all images."""
+
+    def __init__(
+        self, images: UInt8[Tensor, "n h w 3"], masks: Bool[Tensor, "n h w"], band: int
+    ) -> None:
+        """Index the pixels.
+
+        Args:
+            images: training images.
+            masks: their masks.
+            band: pixels by which a mask is grown.
+        """
+        self.images, self.masks = images, masks
+        self.height, self.width = masks.shape[1:]
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band + 1, 2 * band + 1))
+        grown = [np.flatnonzero(cv2.dilate(m.numpy().astype(np.uint8), kernel)) for m in masks]
+        self.pixel = torch.from_numpy(np.concatenate(grown).astype(np.int32))
+        counts = torch.tensor([len(g) for g in grown])
+        self.end = counts.cumsum(0)
+        self.boxes = [_box(m) for m in masks]
+
+    def random(self, count: int, generator: torch.Generator) -> PixelBatch:
+        """Uniformly random pixels of all images."""
+        pick = torch.randint(int(self.end[-1]), (count,), generator=generator)
+        image = torch.searchsorted(self.end, pick, right=True)
+        return self._batch(image, self.pixel[pick].long())
+
+    def patch(self, size: int, generator: torch.Generator) -> PixelBatch:
+        """A square of one image centred on a random pixel of its mask, row by row.
+
+        A patch larger than the image is cut to the image.
+        """
+        image = int(torch.randint(len(self.images), (1,), generator=generator))
+        height, width = min(size, self.height), min(size, self.width)
+        y0, y1, x0, x1 = self.boxes[image]
+        u, v = torch.rand(2, generator=generator).tolist()
+        # Centres anywhere in the box of the mask, so that its borders are seen as often as its middle.
+        top = min(max(int(y0 + u * (y1 - y0)) - height // 2, 0), self.height - height)
+        left = min(max(int(x0 + v * (x1 - x0)) - width // 2, 0), self.width - width)
+        ys = torch.arange(top, top + height)[:, None]
+        xs = torch.arange(left, left + width)[None]
+        flat = (ys * self.width + xs).reshape(-1)
+        return self._batch(torch.full_like(flat, image), flat)
+
+    def _batch(self, image: Tensor, flat: Tensor) -> PixelBatch:
+        y, x = flat // self.width, flat % self.width
+        mask = self.masks[image, y, x]
+        color = self.images[image, y, x].float() / 255.0 * mask[:, None]
+        return PixelBatch(image, torch.stack([x, y], -1).float() + 0.5, color, mask)
+
+
+def _box(mask: Tensor) -> tuple[int, int, int, int]:
+    rows, columns = torch.nonzero(mask.any(1)), torch.nonzero(mask.any(0))
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1

@@ -1,0 +1,198 @@
+"""The configuration of a run: frozen, resolved, written as JSON beside it and read back strictly."""
+
+import dataclasses
+import json
+import typing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from monopart.geometry.errors import InputError
+
+
+@dataclass(frozen=True)
+class GeometryConfig:
+    """Body geometry."""
+
+    parts: Literal["five", "three", "six", "per_limb", "single"] = "five"
+    """Table of parts (METHOD section 2)."""
+    radius: float = 0.06
+    """Largest distance of a sample from the surface of a part that it belongs to, metres."""
+    voxel: float = 0.02
+    """Edge of the shell's voxels, metres; changes the speed, never the image."""
+    step: float = 0.01
+    """Distance of neighbouring samples of a ray, metres (delta t of eq. 9)."""
+    canonical_margin: float = 0.08
+    """Margin of a part's canonical box around its vertices, metres."""
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Part fields (METHOD section 6)."""
+
+    levels: int = 8
+    """Resolutions of the hash grid."""
+    features: int = 2
+    """Features per level: 1, 2 or 4."""
+    log2_size: int = 15
+    """Rows of a level, log2."""
+    base: int = 16
+    """Cells of the first level along the longest edge of a part's box."""
+    finest: float = 0.003
+    """Edge of the finest cells, metres."""
+    hidden: int = 64
+    """Width of the density and colour networks."""
+    geometry_features: int = 15
+    """Features handed from the density to the colour network."""
+    sharpness: float = 100.0
+    """Density in 1/m per unit of softplus."""
+    prior_slope: float = 200.0
+    """Slope k of the distance prior, 1/m (METHOD section 9); 0 leaves the density to the network."""
+    prior_margin: float = 0.015
+    """Distance outside the body at which the prior is neutral, metres."""
+
+
+@dataclass(frozen=True)
+class DeformConfig:
+    """Non-rigid deformation (METHOD section 3)."""
+
+    residual: bool = True
+    """Backward residual in (u, v, t); off, the deformation is skinning alone."""
+    scale: float = 0.05
+    """Largest residual per axis, metres."""
+    hidden: int = 32
+    """Width of the residual networks."""
+    log2_size: int = 14
+    """Rows of a level of the (u, v, t) grid, log2."""
+
+
+@dataclass(frozen=True)
+class AppearanceConfig:
+    """Appearance of a frame (METHOD section 5)."""
+
+    code: int = 8
+    """Length of the code of a training frame; 0 is one appearance for all frames."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights and thresholds of the losses; a term of weight 0 is not computed."""
+
+    mse: float = 1.0
+    """Weight of the squared colour error (eq. 10)."""
+    lpips: float = 0.1
+    """Weight of LPIPS-VGG on patches (eq. 10)."""
+    consistency: float = 1.0
+    """Weight of the bidirectional consistency (eq. 3)."""
+    consistency_threshold: float = 0.01
+    """Round-trip distances below this cost nothing, metres."""
+    consistency_samples: int = 2048
+    """Pairs of a step whose round trip is computed."""
+    offset: float = 0.0
+    """Weight of the mean residual length, 1/m."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Optimisation and batches."""
+
+    iterations: int = 4000
+    """Steps; used when no time is given."""
+    seconds: float | None = None
+    """Wall-clock budget of the loop, seconds; takes the place of `iterations`."""
+    rays: int = 2048
+    """Random pixels of a step, over all training frames."""
+    patch: int = 64
+    """Edge of the LPIPS patch, pixels."""
+    lpips_start: float = 0.4
+    """Part of the run after which patches begin."""
+    lpips_every: int = 2
+    """Steps between two patches."""
+    band: int = 14
+    """Pixels around the mask from which random pixels are drawn."""
+    lr_table: float = 1e-2
+    """Learning rate of the hash tables."""
+    lr_network: float = 2e-3
+    """Learning rate of networks and codes."""
+    lr_final: float = 0.05
+    """Factor of both rates at the end, reached exponentially."""
+    ema: float = 0.995
+    """Decay of the weights' moving average that is rendered and saved; 0 switches it off."""
+    random_background: bool = True
+    """Composite rendering and target over a random colour in training."""
+    occupancy: bool = True
+    """Learn which canonical cells are empty and skip them in training (approximate)."""
+    checkpoint_seconds: float = 60.0
+    """Wall-clock seconds between two saved checkpoints."""
+    log_every: int = 20
+    """Steps between two lines of train.jsonl."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides a run."""
+
+    preset: str = "fast"
+    """Name of the preset this configuration started from."""
+    seed: int = 0
+    """Seed of initial values, batches and jitter."""
+    geometry: GeometryConfig = dataclasses.field(default_factory=GeometryConfig)
+    field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    deform: DeformConfig = dataclasses.field(default_factory=DeformConfig)
+    appearance: AppearanceConfig = dataclasses.field(default_factory=AppearanceConfig)
+    loss: LossConfig = dataclasses.field(default_factory=LossConfig)
+    train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
+
+
+def to_json(config: Config) -> str:
+    """The configuration as indented JSON."""
+    return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
+
+
+def from_json(path: Path) -> Config:
+    """Read a configuration back; unknown, missing or mistyped entries are errors.
+
+    Args:
+        path: a config.json.
+
+    Raises:
+        InputError: the file is absent, not JSON, or does not match.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a run's config.json, found no file") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected JSON, found {error}; restore the file") from None
+    return _build(Config, data, str(path))
+
+
+def _build(kind: Any, data: Any, where: str) -> Any:
+    if not isinstance(data, dict):
+        raise InputError(f"{where}: expected an object, found {type(data).__name__}")
+    fields = {f.name: f for f in dataclasses.fields(kind)}
+    hints = typing.get_type_hints(kind)
+    for name in data.keys() ^ fields.keys():
+        found = "an unknown entry" if name in data else "no entry"
+        raise InputError(f"{where}: {kind.__name__}.{name}: found {found}; use the same version")
+    values = {}
+    for name, value in data.items():
+        hint = hints[name]
+        if dataclasses.is_dataclass(hint):
+            values[name] = _build(hint, value, where)
+        else:
+            values[name] = _checked(value, hint, f"{where}: {kind.__name__}.{name}")
+    return kind(**values)
+
+
+def _checked(value: Any, hint: Any, where: str) -> Any:
+    choices = typing.get_args(hint)
+    if typing.get_origin(hint) is Literal:
+        good = value in choices
+    else:
+        kinds = choices or (hint,)
+        number = float in kinds and isinstance(value, int) and not isinstance(value, bool)
+        good = number or type(value) in kinds
+    if not good:
+        raise InputError(f"{where}: expected {hint}, found {value!r}; restore the file")
+    return value

@@ -1,0 +1,209 @@
+"""The avatar: part fields, residuals and appearance over the geometry of posed bodies."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from monopart.fields.distance_prior import DistancePrior
+from monopart.fields.hash_grid import GridSpec
+from monopart.fields.occupancy import PartOccupancy
+from monopart.fields.part_field import PartField, PartFieldSpec
+from monopart.fields.part_union import union_by_density
+from monopart.fields.residual import UVT_GRID, ResidualField
+from monopart.fields.volume import composite
+from monopart.geometry.body import BodyModel, PosedBody
+from monopart.geometry.cameras import Rays
+from monopart.geometry.culling import ShellSamples
+from monopart.geometry.parts import PartMap
+from monopart.geometry.posed_parts import PartPairs, PosedParts
+
+from .config import Config
+
+
+@dataclass(frozen=True)
+class FrameInput:
+    """What the networks know about each body of a batch.
+
+    Attributes:
+        time: [B] normalised time in [0, 1].
+        code: [B, C] appearance codes, or None.
+    """
+
+    time: Tensor
+    code: Tensor | None
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Colours of rays and what it took.
+
+    Attributes:
+        color: [R, 3] over black.
+        opacity: [R].
+        depth: [R] expected distance along the ray, metres.
+        stats: counts of rays, samples and pairs.
+        pairs: the evaluated pairs, for losses.
+        canonical: [M, 3] canonical points of the pairs after the residual.
+        residual: [M, 3] backward residuals, or None.
+    """
+
+    color: Tensor
+    opacity: Tensor
+    depth: Tensor
+    stats: dict[str, int]
+    samples: ShellSamples
+    pairs: PartPairs
+    canonical: Tensor
+    residual: Tensor | None
+
+
+def select(pairs: PartPairs, rows: Tensor, num_parts: int) -> PartPairs:
+    """The pairs of the given ascending rows."""
+    part = pairs.part[rows]
+    counts = torch.bincount(part, minlength=num_parts).tolist()
+    return PartPairs(
+        pairs.sample[rows], part, pairs.face[rows], pairs.bary[rows], tuple(counts)
+    )
+
+
+class AvatarModel(torch.nn.Module):
+    """All that is learned about a person; geometry comes in per batch."""
+
+    def __init__(self, config: Config, body: BodyModel, canonical: PosedBody, frames: int) -> None:
+        """Build the modules.
+
+        Args:
+            config: the configuration.
+            body: the body model.
+            canonical: the body of the person in the canonical pose.
+            frames: number of training frames.
+        """
+        super().__init__()
+        self.config = config
+        self.parts = PartMap.preset(config.geometry.parts, body.num_joints)
+        self.num_parts = len(self.parts.names)
+        lo, hi = part_boxes(body, canonical, self.parts, config.geometry.canonical_margin)
+        spec, deform = config.field, config.deform
+        self.field = PartField(
+            lo,
+            hi,
+            PartFieldSpec(
+                levels=spec.levels,
+                features=spec.features,
+                log2_size=spec.log2_size,
+                base=spec.base,
+                finest=spec.finest,
+                hidden=spec.hidden,
+                geometry=spec.geometry_features,
+                code=config.appearance.code,
+                sharpness=spec.sharpness,
+            ),
+        )
+        self.prior = None
+        if spec.prior_slope:
+            self.prior = DistancePrior(canonical.verts, body.faces)
+        self.backward_residual = self.forward_residual = None
+        if deform.residual:
+            grid = GridSpec(UVT_GRID.levels, 2, deform.log2_size, UVT_GRID.base, UVT_GRID.growth)
+            self.backward_residual = ResidualField(
+                self.num_parts, deform.scale, grid, deform.hidden
+            )
+            if config.loss.consistency:
+                self.forward_residual = ResidualField(
+                    self.num_parts, deform.scale, grid, deform.hidden
+                )
+        self.codes = None
+        if config.appearance.code:
+            codes = 0.01 * torch.randn(frames, config.appearance.code)
+            self.codes = torch.nn.Parameter(codes)
+        self.occupancy = PartOccupancy(self.field.lo, self.field.edge)
+
+    def density_of(self, points: Tensor, part: Tensor, counts: tuple[int, ...]) -> tuple:
+        """Density, geometry features and hash features of canonical points sorted by part."""
+        encoded = self.field.encode(points, part)
+        prior: Tensor | float = 0.0
+        if self.prior is not None:
+            spec = self.config.field
+            distance = self.prior(points.detach())
+            prior = (spec.prior_slope * (spec.prior_margin - distance)).clamp(-8.0, 8.0)
+        sigma, geometry = self.field.density(encoded, counts, prior)
+        return sigma, geometry, encoded
+
+    def _kept(self, points: Tensor, part: Tensor, valid: Tensor, prune: float) -> Tensor:
+        keep = valid
+        if prune > 0:
+            # A cell is empty when one step through it absorbs less than `prune`.
+            keep = keep & self.occupancy.keep(points, part, prune / self.config.geometry.step)
+        return torch.nonzero(keep).squeeze(-1)
+
+    def render_rays(
+        self,
+        bodies: PosedParts,
+        frames: FrameInput,
+        rays: Rays,
+        body: Tensor | int = 0,
+        jitter: Tensor | None = None,
+        prune: float = 0.0,
+    ) -> Rendered:
+        """Colours of rays over black.
+
+        Args:
+            bodies: posed bodies in their local frames.
+            frames: time and code of each body.
+            rays: [R] rays in the local frame of their body.
+            body: body of each ray.
+            jitter: [R] offsets of the sample lattice in steps.
+            prune: skip canonical cells that absorb less than this per sample; 0 skips none.
+        """
+        step = self.config.geometry.step
+        samples = bodies.shell.sample(rays, step, body, jitter)
+        pairs = bodies.pairs(samples)
+        rest = bodies.unskin(samples, pairs)
+        found = len(pairs.sample)
+        rows = self._kept(rest.points, pairs.part, rest.valid, prune)
+        points, uv = rest.points[rows], rest.uv[rows]
+        pairs = select(pairs, rows, self.num_parts)
+        owner = samples.body[pairs.sample].long()
+        residual = None
+        canonical = points
+        if self.backward_residual is not None:
+            uvt = torch.cat([uv, frames.time[owner, None]], -1)
+            residual = self.backward_residual(uvt, pairs.part, pairs.counts)
+            canonical = points + residual
+        sigma, geometry, encoded = self.density_of(canonical, pairs.part, pairs.counts)
+        if self.training:
+            self.occupancy.see(points, pairs.part, sigma)
+        total = len(samples.depth)
+        union = union_by_density(sigma, pairs.sample, pairs.part, total, self.num_parts)
+        won = pairs.sample[union.winner]
+        code = None if frames.code is None else frames.code[owner[union.winner]]
+        rgb = self.field.color(encoded[union.winner], geometry[union.winner], code, union.counts)
+        color = torch.zeros(total, 3).to(rgb).index_copy(0, won, rgb)
+        delta = torch.full_like(samples.depth, step)
+        out = composite(union.sigma, color, delta, samples.ray_start, samples.depth)
+        stats = {
+            "rays": len(rays.directions),
+            "samples_dense": samples.dense,
+            "samples_shell": total,
+            "pairs_found": found,
+            "pairs_evaluated": len(pairs.sample),
+            "colors_evaluated": len(won),
+        }
+        return Rendered(
+            out.color, out.opacity, out.depth, stats, samples, pairs, canonical, residual
+        )
+
+
+def part_boxes(
+    body: BodyModel, canonical: PosedBody, parts: PartMap, margin: float
+) -> tuple[Tensor, Tensor]:
+    """Canonical box of each part's faces with a margin, metres: lower and upper corners [K, 3]."""
+    face_part = parts.face_parts(body.weights, body.faces)
+    lo, hi = [], []
+    for part in range(len(parts.names)):
+        used = body.faces[face_part == part].unique()
+        corners = canonical.verts[used] if len(used) else canonical.verts.mean(0, keepdim=True)
+        lo.append(corners.amin(0) - margin)
+        hi.append(corners.amax(0) + margin)
+    return torch.stack(lo), torch.stack(hi)

