@@ -1,27 +1,32 @@
-"""Which canonical cells of each part are empty, learned from the samples that training evaluates."""
+"""What training has seen of the density of each part's canonical cells: empty, or opaque."""
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+_GROWTH = 1.05  # of a remembered minimum, each time its cell is seen
+
 
 class PartOccupancy(torch.nn.Module):
-    """A slowly falling maximum of the density seen in each cell; cells never seen count as full.
+    """A slowly falling maximum and a slowly rising minimum of the density seen in each cell.
 
-    Skipping empty cells is approximate: a cell is empty when light loses less than ``threshold``
-    of itself over one sample.
+    Where the maximum is small a sample may be skipped; where minima in front of a sample add up to
+    an opaque wall, it cannot be seen. Both are approximate. A cell that was never seen counts as
+    neither empty nor opaque.
 
     >>> occupancy = PartOccupancy(torch.zeros(1, 3), torch.ones(1), cells=4)
     >>> point, part = torch.full((1, 3), 0.5), torch.zeros(1, dtype=torch.long)
-    >>> before = bool(occupancy.keep(point, part, 1.0))
-    >>> occupancy.see(point, part, torch.zeros(1))
-    >>> before, bool(occupancy.keep(point, part, 1.0))
+    >>> cell = occupancy.cells_of(point, part)
+    >>> before = bool(occupancy.keep(cell, 1.0))
+    >>> occupancy.see(cell, torch.zeros(1))
+    >>> before, bool(occupancy.keep(cell, 1.0))
     (True, False)
     """
 
     lo: Tensor
     edge: Tensor
     peak: Tensor
+    floor: Tensor
 
     def __init__(
         self,
@@ -43,36 +48,56 @@ class PartOccupancy(torch.nn.Module):
         self.register_buffer("lo", lo.clone(), persistent=False)
         self.register_buffer("edge", edge.clone(), persistent=False)
         self.register_buffer("peak", torch.full((len(lo) * cells**3,), torch.inf))
+        self.register_buffer("floor", torch.zeros(len(lo) * cells**3))
 
-    def _cell(self, points: Tensor, part: Tensor) -> Tensor:
-        place = (points - self.lo[part]) / self.edge[part, None] * self.cells
-        x, y, z = place.long().clamp(0, self.cells - 1).unbind(-1)
+    def cells_of(self, points: Float[Tensor, "n 3"], part: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
+        """Flat index of the cell of each canonical point (metres) in the grid of its part."""
+        place = (points - self.lo[part]) * (self.cells / self.edge)[part, None]
+        x, y, z = place.long().clamp_(0, self.cells - 1).unbind(-1)
         return ((part * self.cells + z) * self.cells + y) * self.cells + x
 
-    def keep(
-        self, points: Float[Tensor, "n 3"], part: Int[Tensor, "n"], density: float
-    ) -> Bool[Tensor, "n"]:
-        """Whether the cell of a point may hold more than a density.
+    def keep(self, cell: Int[Tensor, "n"], density: float) -> Bool[Tensor, "n"]:
+        """Whether a cell may hold more than a density.
 
         Args:
-            points: canonical points, metres.
-            part: part of each point.
+            cell: from :meth:`cells_of`.
             density: 1/m.
         """
-        return self.peak[self._cell(points, part)] > density
+        return self.peak[cell] > density
 
     @torch.no_grad()
-    def see(
-        self, points: Float[Tensor, "n 3"], part: Int[Tensor, "n"], sigma: Float[Tensor, "n"]
-    ) -> None:
-        """Remember densities: the cell's value becomes max(decay * value, largest sigma seen now).
+    def see(self, cell: Int[Tensor, "n"], sigma: Float[Tensor, "n"]) -> None:
+        """Remember densities.
 
         Args:
-            points: canonical points that were evaluated, metres.
-            part: part of each point.
+            cell: cells of the points that were evaluated.
             sigma: their densities, 1/m.
         """
-        cell = self._cell(points, part)
-        old = self.peak[cell]
-        self.peak[cell] = torch.where(old.isinf(), 0.0, old * self.decay)
-        self.peak.scatter_reduce_(0, cell, sigma.detach(), "amax")
+        sigma = sigma.detach()
+        old, low = self.peak[cell], self.floor[cell]
+        first = old.isinf()
+        self.peak[cell] = torch.where(first, 0.0, old * self.decay)
+        self.peak.scatter_reduce_(0, cell, sigma, "amax")
+        self.floor[cell] = torch.where(first, torch.inf, low * _GROWTH)
+        self.floor.scatter_reduce_(0, cell, sigma, "amin")
+
+
+def visible_samples(
+    wall: Float[Tensor, "n"], ray_start: Int[Tensor, "r1"], ray: Int[Tensor, "n"], limit: float
+) -> Bool[Tensor, "n"]:
+    """Samples with less than a given optical depth in front of them.
+
+    Args:
+        wall: optical depth of each sample (density times step), a lower bound.
+        ray_start: first sample of each ray, and the end.
+        ray: ray of each sample.
+        limit: optical depth beyond which nothing is seen; 10 leaves 5e-5 of the light.
+
+    >>> wall, ray = torch.tensor([6.0, 6.0, 6.0, 1.0]), torch.tensor([0, 0, 0, 1])
+    >>> visible_samples(wall, torch.tensor([0, 3, 4]), ray, 10.0).tolist()
+    [True, True, False, True]
+    """
+    total = wall.double().cumsum(0)
+    before = total - wall
+    base = torch.cat([total.new_zeros(1), total])[ray_start[:-1]]
+    return before - base[ray.long()] < limit

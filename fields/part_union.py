@@ -52,7 +52,11 @@ def union_by_density(
     with torch.no_grad():
         table = torch.full((num_parts, num_samples), -1.0, dtype=sigma.dtype, device=sigma.device)
         table[part, sample] = sigma
-        best = table.argmax(0)  # first of equals
+        best, value = sample.new_zeros(num_samples), table[0]
+        for k in range(1, num_parts):  # K passes beat argmax over a short leading axis
+            better = table[k] > value  # the first of equals stays
+            best = torch.where(better, k, best)
+            value = torch.where(better, table[k], value)
         won = best[sample] == part
     winner = rows[won]
     total = torch.zeros(num_samples, dtype=sigma.dtype, device=sigma.device)

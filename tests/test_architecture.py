@@ -26,7 +26,8 @@ class NoArguments(list):
     def __getitem__(self, index): raise RuntimeError("an import read sys.argv")
     __iter__ = __len__ = __getitem__
 
-import numpy, torch
+import numpy, rich.console, rich.progress, torch  # rich draws random numbers when it is imported
+
 sys.argv = NoArguments()
 seed, numpy_seed = torch.initial_seed(), numpy.random.get_state()[1].tolist()
 state, python_state = torch.get_rng_state(), random.getstate()
@@ -45,13 +46,15 @@ for root in ("geometry", "fields", "toolkit", "tools"):
         if info.name.rpartition(".")[2] != "__main__":
             importlib.import_module(info.name)
 assert not torch.cuda.is_initialized()
-assert torch.initial_seed() == seed and torch.equal(torch.get_rng_state(), state)
-assert numpy.random.get_state()[1].tolist() == numpy_seed and random.getstate() == python_state
+assert torch.initial_seed() == seed, "an import seeded torch"
+assert torch.equal(torch.get_rng_state(), state), "an import drew random numbers"
+assert numpy.random.get_state()[1].tolist() == numpy_seed, "an import seeded numpy"
+assert random.getstate() == python_state, "an import seeded random"
 assert threading.active_count() == threads, threading.enumerate()
 assert (torch.get_default_dtype(), torch.is_grad_enabled()) == (dtype, grad)
 assert torch.get_num_threads() == count
 if "warp" in sys.modules:  # the module may be loaded, its runtime must not be
-    assert sys.modules["warp"]._src.context.runtime is None
+    assert sys.modules["warp"]._src.context.runtime is None, "an import started warp"
 print("clean")
 """
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from monopart.fields.distance_prior import DistancePrior
 from monopart.fields.hash_grid import GridSpec
-from monopart.fields.occupancy import PartOccupancy
+from monopart.fields.occupancy import PartOccupancy, visible_samples
 from monopart.fields.part_field import PartField, PartFieldSpec
 from monopart.fields.part_union import union_by_density
 from monopart.fields.residual import UVT_GRID, ResidualField
@@ -16,9 +16,11 @@ from monopart.geometry.body import BodyModel, PosedBody
 from monopart.geometry.cameras import Rays
 from monopart.geometry.culling import ShellSamples
 from monopart.geometry.parts import PartMap
-from monopart.geometry.posed_parts import PartPairs, PosedParts
+from monopart.geometry.posed_parts import PartPairs, PosedParts, RestPoints
 
 from .config import Config
+
+HIDDEN = 10.0  # optical depth in front of a sample that hides it: 5e-5 of the light is left
 
 
 @dataclass(frozen=True)
@@ -130,12 +132,23 @@ class AvatarModel(torch.nn.Module):
         sigma, geometry = self.field.density(encoded, counts, prior)
         return sigma, geometry, encoded
 
-    def _kept(self, points: Tensor, part: Tensor, valid: Tensor, prune: float) -> Tensor:
-        keep = valid
+    def _kept(
+        self, samples: ShellSamples, pairs: PartPairs, rest: RestPoints, prune: float
+    ) -> tuple[Tensor, Tensor]:
+        """Rows of the pairs worth evaluating, and the occupancy cells of those rows."""
+        cell = self.occupancy.cells_of(rest.points, pairs.part)
+        keep = rest.valid
         if prune > 0:
+            step = self.config.geometry.step
             # A cell is empty when one step through it absorbs less than `prune`.
-            keep = keep & self.occupancy.keep(points, part, prune / self.config.geometry.step)
-        return torch.nonzero(keep).squeeze(-1)
+            keep = keep & self.occupancy.keep(cell, prune / step)
+            wall = torch.zeros_like(samples.depth)
+            opaque = self.occupancy.floor[cell] * step
+            wall.scatter_reduce_(0, pairs.sample, opaque, "amax")
+            seen = visible_samples(wall, samples.ray_start, samples.ray, HIDDEN)
+            keep = keep & seen[pairs.sample]
+        rows = torch.nonzero(keep).squeeze(-1)
+        return rows, cell[rows]
 
     def render_rays(
         self,
@@ -161,7 +174,7 @@ class AvatarModel(torch.nn.Module):
         pairs = bodies.pairs(samples)
         rest = bodies.unskin(samples, pairs)
         found = len(pairs.sample)
-        rows = self._kept(rest.points, pairs.part, rest.valid, prune)
+        rows, cell = self._kept(samples, pairs, rest, prune)
         points, uv = rest.points[rows], rest.uv[rows]
         pairs = select(pairs, rows, self.num_parts)
         owner = samples.body[pairs.sample].long()
@@ -173,7 +186,7 @@ class AvatarModel(torch.nn.Module):
             canonical = points + residual
         sigma, geometry, encoded = self.density_of(canonical, pairs.part, pairs.counts)
         if self.training:
-            self.occupancy.see(points, pairs.part, sigma)
+            self.occupancy.see(cell, sigma)
         total = len(samples.depth)
         union = union_by_density(sigma, pairs.sample, pairs.part, total, self.num_parts)
         won = pairs.sample[union.winner]

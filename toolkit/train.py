@@ -23,6 +23,7 @@ from .lpips import LPIPS, load_lpips
 from .model import Rendered
 
 MAX_BAD_STEPS = 20  # non-finite losses in a row after which a run ends
+PRUNE = 2e-3  # absorption of a step below which a canonical cell counts as empty in training
 PROBE_EVERY = 16  # steps between two renderings without learned skipping, which refresh it
 
 Progress = Callable[[float, dict[str, float]], None]
@@ -109,7 +110,7 @@ class Trainer:
             rays,
             body,
             jitter,
-            prune=0.0 if probe else 1e-3,
+            prune=0.0 if probe else PRUNE,
         )
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Rendered]:
@@ -180,14 +181,14 @@ class Trainer:
         self.result.stats.update(out.stats)
         total = torch.stack(list(terms.values())).sum()
         self.optimizer.zero_grad(set_to_none=True)
-        if not math.isfinite(float(total)):
+        if not math.isfinite(float(total.detach())):
             self._bad_step(terms)
             return self.last
         self.bad_steps = 0
         total.backward()
         self.optimizer.step()
         self._average(step)
-        self.last = {name: float(term) for name, term in terms.items()}
+        self.last = {name: float(term.detach()) for name, term in terms.items()}
         mse = self.last["mse"] / (self.config.loss.mse or 1.0)
         self.last["psnr"] = -10.0 * math.log10(max(mse, 1e-12))
         return self.last
@@ -195,7 +196,7 @@ class Trainer:
     def _bad_step(self, terms: dict[str, Tensor]) -> None:
         """Skip a step whose loss is not finite; end the run when that keeps happening."""
         self.bad_steps += 1
-        named = ", ".join(n for n, t in terms.items() if not math.isfinite(float(t)))
+        named = ", ".join(n for n, t in terms.items() if not math.isfinite(float(t.detach())))
         if self.bad_steps >= MAX_BAD_STEPS:
             raise MonopartError(
                 f"training: the terms {named} were not finite in {MAX_BAD_STEPS} steps in a row; "

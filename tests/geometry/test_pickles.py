@@ -69,9 +69,7 @@ def test_array_written_by_python_2() -> None:
     np.testing.assert_array_equal(load_restricted(io.BytesIO(content), "file")["K"], [1.5, -2.0])
 
 
-def test_sparse_loads_where_scipy_is_absent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sparse_loads_where_scipy_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     matrix = sparse.csc_matrix(np.array([[0.0, 2], [3, 0], [0, 4]]))
     data = pickle.dumps(matrix, protocol=2)
     for module in [m for m in sys.modules if m.split(".")[0] == "scipy"]:
