@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from monopart.geometry.culling import BodyShell
 from monopart.geometry.errors import InputError
 from monopart.geometry.surface import SurfaceIndex, signed_distance, vertex_normals
 
@@ -39,11 +40,14 @@ class DistancePrior(torch.nn.Module):
             cell: edge of a grid cell, metres.
 
         Raises:
-            InputError: reach or cell not positive.
+            InputError: not 0 < cell <= reach.
         """
         super().__init__()
-        if not (reach > 0 and cell > 0):
-            raise InputError(f"reach, cell: expected metres > 0, found {reach}, {cell}")
+        if not 0 < cell <= reach:
+            raise InputError(
+                f"reach, cell: expected 0 < cell <= reach in metres, found {reach}, {cell}; "
+                "a cell of a tenth of the reach is usual"
+            )
         verts = verts.detach().float()
         lo = verts.amin(0) - reach
         steps = ((verts.amax(0) + reach - lo) / cell).ceil().long() + 1
@@ -52,10 +56,13 @@ class DistancePrior(torch.nn.Module):
         axes = [lo[a] + cell * torch.arange(int(steps[a]), device=lo.device) for a in range(3)]
         z, y, x = torch.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
         nodes = torch.stack([x, y, z], -1).reshape(-1, 3)
-        hit = SurfaceIndex(verts, faces).query(nodes, max_distance=reach)
-        distance = signed_distance(nodes, hit, vertex_normals(verts, faces), faces)
-        values = distance.clamp(-reach, reach).reshape(1, 1, *z.shape)
-        self.register_buffer("values", values, persistent=False)
+        near = BodyShell(verts, faces, reach).occupied(nodes)
+        found = nodes[near]
+        hit = SurfaceIndex(verts, faces).query(found, max_distance=reach)
+        distance = torch.full_like(nodes[:, 0], torch.inf)
+        distance[near] = signed_distance(found, hit, vertex_normals(verts, faces), faces)
+        values = _fill_unknown(distance.reshape(z.shape), reach).clamp(-reach, reach)
+        self.register_buffer("values", values[None, None], persistent=False)
 
     def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Signed distance, metres, negative inside.
@@ -71,3 +78,15 @@ class DistancePrior(torch.nn.Module):
             self.values, place[None, None, None], padding_mode="border", align_corners=True
         )
         return sampled.reshape(-1)
+
+
+def _fill_unknown(distance: Tensor, reach: float) -> Tensor:
+    """Nodes beyond the reach (infinite) get ±reach: the side of the last known node along x.
+
+    A row of nodes starts outside, and to change sides it has to pass nodes within the reach.
+    """
+    known = distance.isfinite()
+    place = torch.arange(distance.shape[-1], device=distance.device).expand_as(distance)
+    last = torch.where(known, place, -1).cummax(-1).values
+    side = torch.where(last < 0, 1.0, distance.gather(-1, last.clamp(min=0)).sign())
+    return torch.where(known, distance, reach * side)

@@ -11,6 +11,8 @@ from torch.nn import functional
 from .hash_grid import GridSpec, HashGrid
 from .mlp import PartMLP
 
+Number = int | float
+
 
 @dataclass(frozen=True)
 class PartFieldSpec:
@@ -50,7 +52,7 @@ class PartFieldSpec:
         return specs
 
 
-def _each(value: float | tuple[float, ...], count: int) -> tuple[float, ...]:
+def _each(value: Number | tuple[Number, ...], count: int) -> tuple[Number, ...]:
     return value if isinstance(value, tuple) else (value,) * count
 
 

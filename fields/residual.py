@@ -1,4 +1,4 @@
-"""Non-rigid residuals in the surface-time space (u, v, t), per part (MonoPartNeRF, eqs. 1 and 2)."""
+"""Non-rigid residuals in surface-time space (u, v, t), per part (MonoPartNeRF, eqs. 1 and 2)."""
 
 from collections.abc import Sequence
 

@@ -28,8 +28,8 @@ def round_trip(
     tensor([0., 0.])
     """
     square = (points - forward(backward(points))).square().sum(-1)
-    positive = square > 0
-    return torch.where(positive, torch.where(positive, square, 1.0).sqrt(), 0.0)
+    zero = square == 0
+    return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())
 
 
 def consistency_loss(distance: Shaped[Tensor, "..."], threshold: float = 0.05) -> Float[Tensor, ""]:
@@ -37,10 +37,12 @@ def consistency_loss(distance: Shaped[Tensor, "..."], threshold: float = 0.05) -
 
     Args:
         distance: round-trip distances, metres, any shape.
-        threshold: metres; smaller distances cost nothing (0.05 in the authors' code, 0.01-0.02 bite more).
+        threshold: metres; smaller distances cost nothing (0.05 in the authors' code, 0.01-0.02
+            bite more).
 
     Returns:
-        The loss in metres, differentiable in the distances that exceed the threshold.
+        The loss in metres, differentiable in the distances that exceed the threshold; NaN where
+        a distance is NaN.
 
     Raises:
         InputError: the threshold is negative or not a number.
@@ -52,5 +54,5 @@ def consistency_loss(distance: Shaped[Tensor, "..."], threshold: float = 0.05) -
     """
     if not threshold >= 0:
         raise InputError(f"threshold: expected metres >= 0, found {threshold}; use 0.05")
-    over = distance > threshold
+    over = ~(distance <= threshold)  # NaN counts, so that it is seen
     return torch.where(over, distance, 0.0).sum() / over.sum().clamp(min=1)

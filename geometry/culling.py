@@ -1,10 +1,11 @@
 """The shell around posed bodies: what lies farther than a radius from every surface is skipped.
 
-Voxels are marked conservatively: a voxel without a part's bit holds no point within the radius of that part, so that
-skipping it is exact. One object holds the shells of many bodies (the frames of a capture), and its methods take the
-index of the body of every ray or point.
+Voxels are marked conservatively: a voxel without a part's bit holds no point within the radius of
+that part, so that skipping it is exact. One object holds the shells of many bodies (the frames of a
+capture), and its methods take the index of the body of every ray or point.
 """
 
+import copy
 from dataclasses import dataclass
 
 import torch
@@ -26,7 +27,8 @@ class ShellSamples:
         body: [M] int32 index of the body.
         candidates: [M] int32, bit k set where part k may be within its radius.
         ray_start: [R + 1] int64, ray r owns rows ray_start[r] to ray_start[r + 1].
-        dense: number of lattice samples in the boxes of the bodies: what a renderer without shell evaluates.
+        dense: number of lattice samples in the boxes of the bodies: what a renderer without shell
+            evaluates.
     """
 
     points: Float[Tensor, "m 3"]
@@ -110,7 +112,7 @@ class BodyShell:
         from .kernels.shell import splat_bodies
 
         bits = _vertex_bits(faces, face_part, verts.shape[1])
-        # Radius of a vertex: the largest of its parts', its triangles' reach, half a voxel diagonal.
+        # the largest radius of its parts, the reach of its triangles, half a voxel diagonal
         owned = (bits[:, None] >> torch.arange(self.num_parts, device=bits.device)) & 1
         radius = (owned * self.radius[: self.num_parts]).amax(1)
         half = self.voxel * 3**0.5 / 2
@@ -135,6 +137,12 @@ class BodyShell:
             self.voxel,
             view(self.grid),
         ]
+
+    def filled(self) -> "BodyShell":
+        """The same boxes with every voxel marked for every part: a renderer without skipping."""
+        other = copy.copy(self)
+        other.grid = torch.full_like(self.grid, (1 << self.num_parts) - 1)
+        return other
 
     def _bodies(self, body: Tensor | int, count: int) -> Tensor:
         if isinstance(body, int):

@@ -1,10 +1,12 @@
 """The parts of many posed bodies, ready to be asked: samples -> (sample, part) pairs -> rest.
 
 This is the hot path of a part-based method as three calls that another method can use alone:
-``shell.sample`` (rays to samples), ``pairs`` (closest surface of each part within its radius) and ``unskin``
-(canonical point and UV of each pair). Nothing here is differentiable: poses are constants.
+``shell.sample`` (rays to samples), ``pairs`` (closest surface of each part within its radius) and
+``unskin`` (canonical point and UV of each pair). Poses are constants; only ``reskin`` is
+differentiable, in its points.
 """
 
+import copy
 from dataclasses import dataclass
 
 import torch
@@ -76,7 +78,7 @@ def _rows(transforms: Tensor) -> Tensor:
 
 
 class PosedParts:
-    """Search structures of the parts of one or many posed bodies, and the maps to canonical space."""
+    """Search structures of the parts of posed bodies, and the maps to canonical space."""
 
     def __init__(
         self,
@@ -132,6 +134,12 @@ class PosedParts:
         ]
         ids = [[tree.id if tree is not None else 0 for tree in row] for row in self._trees]
         self._ids = torch.tensor(ids, dtype=torch.int64, device=self.device)
+
+    def unculled(self) -> "PosedParts":
+        """The same bodies without voxel culling, for comparison: slower, the same pairs."""
+        other = copy.copy(self)
+        other.shell = self.shell.filled()
+        return other
 
     def pairs(self, samples: ShellSamples) -> PartPairs:
         """Every (sample, part) whose part surface is within that part's radius.

@@ -1,10 +1,12 @@
 """Closest point on a triangle mesh: a plain torch reference and a Warp search, both differentiable.
 
-The search itself is piecewise constant. Once the face is known, barycentrics, point and distance are evaluated by
-ordinary torch operations, so their gradients in the points and in the vertices are exact (envelope theorem for the
-distance). Reference: C. Ericson, Real-Time Collision Detection, 2005, ch. 5.1.5 (regions of a triangle).
+The search itself is piecewise constant. Once the face is known, barycentrics, point and distance
+are evaluated by ordinary torch operations, so their gradients in the points and in the vertices are
+exact (envelope theorem for the distance). Reference: C. Ericson, Real-Time Collision Detection,
+2005, ch. 5.1.5 (regions of a triangle).
 """
 
+import importlib.util
 import math
 from dataclasses import dataclass
 
@@ -12,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .errors import InputError
+from .errors import BackendError, InputError
 
 _CHUNK = 1 << 22  # (point, face) pairs of one step of the reference
 
@@ -37,7 +39,7 @@ class SurfaceHit:
 
 
 def _ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
-    """numerator / denominator in [0, 1], 0 where the denominator vanishes, with finite gradients."""
+    """Quotient clamped to [0, 1], 0 where the denominator vanishes, with finite gradients."""
     safe = denominator.abs() > torch.finfo(denominator.dtype).tiny
     ratio = torch.where(safe, numerator, 0.0) / torch.where(safe, denominator, 1.0)
     return ratio.clamp(0.0, 1.0)
@@ -93,10 +95,10 @@ def closest_on_triangle(
 
 
 def _norm(vectors: Tensor) -> Tensor:
-    """Length whose gradient at zero is zero instead of NaN."""
+    """Length whose gradient at zero is zero instead of NaN; NaN stays NaN."""
     square = vectors.square().sum(-1)
-    positive = square > 0
-    return torch.where(positive, torch.where(positive, square, 1.0).sqrt(), 0.0)
+    zero = square == 0
+    return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())
 
 
 def _check(points: Tensor, verts: Tensor, faces: Tensor) -> None:
@@ -140,6 +142,15 @@ def _search_torch(points: Tensor, verts: Tensor, faces: Tensor) -> Tensor:
     return torch.cat(best) if best else torch.zeros(0, dtype=torch.long, device=points.device)
 
 
+def _choose_backend(backend: str) -> str:
+    if backend not in ("auto", "warp", "torch"):
+        raise InputError(f"backend: expected auto, warp or torch, found {backend!r}; pick one")
+    installed = importlib.util.find_spec("warp") is not None
+    if backend == "warp" and not installed:
+        raise BackendError("backend 'warp' is not installed; run: pip install 'warp-lang>=1.19'")
+    return ("warp" if installed else "torch") if backend == "auto" else backend
+
+
 class SurfaceIndex:
     """A search structure over one triangle mesh, refit when only the vertices move.
 
@@ -157,16 +168,17 @@ class SurfaceIndex:
         Args:
             verts: vertices, metres.
             faces: vertex indices.
-            backend: "warp" (bounding-volume hierarchy), "torch" (brute force) or "auto" (warp). The warp search
-                runs in float32; distances are then evaluated in the dtype of the input.
+            backend: "warp" (bounding-volume hierarchy), "torch" (brute force) or "auto" (warp where
+                it is installed). The warp search runs in float32 and passes over faces without
+                area, whose points belong to their neighbours too unless such a face stands alone;
+                distances are evaluated in the dtype of the input.
 
         Raises:
             InputError: faces are empty or out of range, or the backend is unknown.
+            BackendError: Warp was asked for by name and is not installed.
         """
-        if backend not in ("auto", "warp", "torch"):
-            raise InputError(f"backend: expected auto, warp or torch, found {backend!r}")
+        self.backend = _choose_backend(backend)
         _check(verts, verts, faces)
-        self.backend = "warp" if backend == "auto" else backend
         self.faces = faces.long()
         self._mesh = None
         self._set(verts)
@@ -247,7 +259,7 @@ def closest_point(
     max_distance: float = math.inf,
     backend: str = "auto",
 ) -> SurfaceHit:
-    """Closest surface point of each query point; build a :class:`SurfaceIndex` to ask more than once.
+    """Closest surface point of each query point; to ask more than once, use `SurfaceIndex`.
 
     Args:
         points: query points, metres.
@@ -302,7 +314,7 @@ def signed_distance(
     normals: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
 ) -> Float[Tensor, "n"]:
-    """Distance of each point with a sign: negative behind the interpolated vertex normal of its hit.
+    """Distance with a sign: negative behind the interpolated vertex normal of the hit.
 
     Args:
         points: query points.
@@ -315,4 +327,4 @@ def signed_distance(
     """
     normal = (hit.bary[..., None] * normals[faces[hit.face]]).sum(-2)
     side = ((points - hit.point) * normal).sum(-1)
-    return torch.where(side < 0, -hit.distance, hit.distance)
+    return torch.where((side < 0) & hit.found, -hit.distance, hit.distance)

@@ -92,3 +92,59 @@ def random_body(seed: int, num_verts: int = 40, pose_blend: bool = True) -> dict
         "shapedirs": rng.normal(size=(num_verts, 3, 4)) * 0.05,
         "posedirs": posedirs if pose_blend else np.zeros_like(posedirs),
     }
+
+
+# --- closest points on triangles ----------------------------------------------------------------
+
+
+def _closest_on_segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    square = float((b - a) @ (b - a))
+    along = 0.0 if square == 0.0 else min(max(float((p - a) @ (b - a)) / square, 0.0), 1.0)
+    return a + along * (b - a)
+
+
+def closest_on_triangle(p: np.ndarray, triangle: np.ndarray) -> np.ndarray:
+    """Nearest point of a triangle, degenerate or not: the foot on its plane, or of an edge."""
+    a, b, c = (np.asarray(corner, dtype=np.float64) for corner in triangle)
+    candidates = [_closest_on_segment(p, *edge) for edge in ((a, b), (b, c), (c, a))]
+    normal = np.cross(b - a, c - a)
+    square = float(normal @ normal)
+    if square > 0.0:
+        foot = p - normal * float((p - a) @ normal) / square
+        sides = [np.cross(v - u, foot - u) @ normal for u, v in ((a, b), (b, c), (c, a))]
+        if min(sides) >= 0.0:
+            candidates.append(foot)
+    return min(candidates, key=lambda q: float((p - q) @ (p - q)))
+
+
+def closest_on_mesh(
+    points: np.ndarray, verts: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest surface points and their distances, over every face."""
+    found = np.zeros((len(points), 3))
+    distance = np.full(len(points), np.inf)
+    for i, p in enumerate(np.asarray(points, dtype=np.float64)):
+        for face in faces:
+            q = closest_on_triangle(p, verts[face])
+            gap = float(np.sqrt((p - q) @ (p - q)))
+            if gap < distance[i]:
+                found[i], distance[i] = q, gap
+    return found, distance
+
+
+def sphere(radius: float, rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and outward faces of a latitude-longitude sphere about the origin."""
+    polar = np.pi * np.arange(1, rings) / rings
+    turn = 2 * np.pi * np.arange(sectors) / sectors
+    body = [(np.sin(t) * np.cos(f), np.cos(t), -np.sin(t) * np.sin(f)) for t in polar for f in turn]
+    verts = radius * np.array([(0.0, 1.0, 0.0), *body, (0.0, -1.0, 0.0)])
+    last = len(verts) - 1
+    faces = []
+    for s in range(sectors):
+        n = (s + 1) % sectors
+        faces.append((0, 1 + s, 1 + n))
+        faces.append((last, last - sectors + n, last - sectors + s))
+        for r in range(rings - 2):
+            a, b = 1 + r * sectors + s, 1 + r * sectors + n
+            faces += [(a, a + sectors, b), (b, a + sectors, b + sectors)]
+    return verts, np.array(faces)

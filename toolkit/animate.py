@@ -3,9 +3,12 @@
 import numpy as np
 import torch
 
+from monopart.geometry.body import BodyPose
 from monopart.geometry.cameras import Camera, orbit_cameras
+from monopart.geometry.errors import InputError
 
 from .avatar import Avatar, View
+from .captures.records import CaptureRecord
 
 
 def turntable_views(
@@ -18,12 +21,14 @@ def turntable_views(
         count: number of views of one turn.
         frame: frame that gives the pose; the first training frame if None.
         size: longer side of the pictures, pixels; the training camera's if None.
+
+    Raises:
+        InputError: no such frame.
     """
     record = avatar.record
     train = record.split("train")
     frame = train.frames[0] if frame is None else frame
-    record.frame(train.cameras[0], frame)  # a clear error for an unknown frame
-    pose = record.poses[frame]
+    pose = pose_of(record, frame)
     with torch.no_grad():
         joints = record.body(pose)
     center = joints.to_world(joints.joints).mean(0)
@@ -33,6 +38,21 @@ def turntable_views(
     up = world_up(record.cameras)
     cameras = orbit_cameras(camera, center, up, count)
     return [View(c, pose, frame) for c in cameras]
+
+
+def pose_of(record: CaptureRecord, frame: int) -> BodyPose:
+    """The body pose of a frame.
+
+    Raises:
+        InputError: the frame has none.
+    """
+    if frame not in record.poses:
+        known = sorted(record.poses)
+        raise InputError(
+            f"--frame {frame}: expected a frame with a body pose, {known[0]} to {known[-1]}, "
+            "found none; choose one of these"
+        )
+    return record.poses[frame]
 
 
 def world_up(cameras: list[Camera]) -> torch.Tensor:

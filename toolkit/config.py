@@ -20,7 +20,7 @@ class GeometryConfig:
     """Largest distance of a sample from the surface of a part that it belongs to, metres."""
     voxel: float = 0.02
     """Edge of the shell's voxels, metres; changes the speed, never the image."""
-    step: float = 0.01
+    step: float = 0.0125
     """Distance of neighbouring samples of a ray, metres (delta t of eq. 9)."""
     canonical_margin: float = 0.08
     """Margin of a part's canonical box around its vertices, metres."""
@@ -96,7 +96,7 @@ class LossConfig:
 class TrainConfig:
     """Optimisation and batches."""
 
-    iterations: int = 4000
+    iterations: int = 1500
     """Steps; used when no time is given."""
     seconds: float | None = None
     """Wall-clock budget of the loop, seconds; takes the place of `iterations`."""
@@ -110,13 +110,13 @@ class TrainConfig:
     """Steps between two patches."""
     band: int = 14
     """Pixels around the mask from which random pixels are drawn."""
-    lr_table: float = 1e-2
+    lr_table: float = 6e-2
     """Learning rate of the hash tables."""
-    lr_network: float = 2e-3
+    lr_network: float = 1e-2
     """Learning rate of networks and codes."""
-    lr_final: float = 0.05
+    lr_final: float = 0.03
     """Factor of both rates at the end, reached exponentially."""
-    ema: float = 0.995
+    ema: float = 0.98
     """Decay of the weights' moving average that is rendered and saved; 0 switches it off."""
     random_background: bool = True
     """Composite rendering and target over a random colour in training."""

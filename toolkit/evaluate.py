@@ -1,8 +1,10 @@
 """Scores of an avatar on the held-out splits of its capture (METHOD section 11)."""
 
+import csv
+import io
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -95,3 +97,21 @@ def evaluate_split(
             progress(len(images), len(pairs))
     mean = aggregate([i.scores for i in images])
     return Evaluation(split, "strict", mean, images, dict(stats))
+
+
+def images_csv(evaluation: Evaluation, camera_names: Sequence[str]) -> str:
+    """One line per image: camera, frame, each metric of each region, seconds of the rendering.
+
+    Args:
+        evaluation: scores of a split.
+        camera_names: name of each camera of the capture.
+    """
+    columns = [(r, m) for r, scores in evaluation.mean.items() for m in scores]
+    file = io.StringIO()
+    table = csv.writer(file, lineterminator="\n")
+    table.writerow(["camera", "frame", *(f"{r}_{m}" for r, m in columns), "seconds"])
+    for image in evaluation.images:
+        values = (image.scores[r][m] for r, m in columns)
+        cells = ["" if v is None else f"{v:.6g}" for v in values]
+        table.writerow([camera_names[image.camera], image.frame, *cells, f"{image.seconds:.3f}"])
+    return file.getvalue()

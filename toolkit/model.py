@@ -64,9 +64,7 @@ def select(pairs: PartPairs, rows: Tensor, num_parts: int) -> PartPairs:
     """The pairs of the given ascending rows."""
     part = pairs.part[rows]
     counts = torch.bincount(part, minlength=num_parts).tolist()
-    return PartPairs(
-        pairs.sample[rows], part, pairs.face[rows], pairs.bary[rows], tuple(counts)
-    )
+    return PartPairs(pairs.sample[rows], part, pairs.face[rows], pairs.bary[rows], tuple(counts))
 
 
 class AvatarModel(torch.nn.Module):

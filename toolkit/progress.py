@@ -56,8 +56,8 @@ def _plain(title: str) -> Update:
         if elapsed - shown[0] < PLAIN_EVERY and done < 1.0:
             return
         shown[0] = elapsed
-        left = elapsed / done - elapsed if done > 0 else float("nan")
-        line = f"{title}: {done:4.0%}, {elapsed:.0f} s, {left:.0f} s left {note}".rstrip()
+        left = f", {elapsed / done - elapsed:.0f} s left" if done > 0 else ""
+        line = f"{title}: {done:4.0%}, {elapsed:.0f} s{left}  {note}".rstrip()
         print(line, file=sys.stderr, flush=True)
 
     return update

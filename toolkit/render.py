@@ -1,4 +1,4 @@
-"""Pictures of an avatar, in chunks of rays, with everything skipped that a picture does not need."""
+"""Pictures of an avatar, in chunks of rays; what a picture does not need is skipped."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -14,6 +14,14 @@ from .avatar import Avatar, View
 from .scene import SceneBodies, shell_pixels
 
 CHUNK = 8192  # rays at a time: bounds the memory
+STATS = (
+    "rays",
+    "samples_dense",
+    "samples_shell",
+    "pairs_found",
+    "pairs_evaluated",
+    "colors_evaluated",
+)
 
 
 @dataclass(frozen=True)
@@ -24,7 +32,7 @@ class Picture:
         color: [H, W, 3] sRGB in [0, 1] over the background.
         opacity: [H, W].
         depth: [H, W] expected distance along the ray, metres; 0 where nothing is.
-        stats: counts of rays, samples, pairs and what was skipped.
+        stats: counts: "pixels" of the image and those named in `STATS`.
     """
 
     color: Float[Tensor, "h w 3"]
@@ -48,8 +56,10 @@ def render_view(
         avatar: the person.
         view: camera and pose.
         background: grey level behind the person, in [0, 1].
-        prune: skip learned empty cells that absorb less than this per sample (approximate); 0: exact.
-        skip: leave out rays that miss the shell (exact); off renders every pixel of the image.
+        prune: skip learned empty cells that absorb less than this per sample (approximate); 0 is
+            exact.
+        skip: leave out rays and samples outside the body shell (exact); off evaluates every part
+            at every sample in the box of the body: the dense renderer, for comparison.
         scene: the posed body if it exists already.
     """
     model = avatar.model.eval()
@@ -62,13 +72,15 @@ def render_view(
         index = torch.arange(height * width)
         rays = scene.local_rays(view.camera.rays(view.camera.pixel_grid().reshape(-1, 2)), 0)
         rays = Rays(rays.origins.expand_as(rays.directions), rays.directions)
+    bodies = scene.parts if skip else scene.parts.unculled()
     color = torch.zeros(height * width, 3)
     opacity, depth = torch.zeros(2, height * width).unbind(0)
-    stats: Counter[str] = Counter(pixels=height * width)
+    # Every count is there, also where no ray hits the shell.
+    stats: Counter[str] = Counter({"pixels": height * width, **dict.fromkeys(STATS, 0)})
     for start in range(0, len(index), CHUNK):
         part = slice(start, start + CHUNK)
         chunk = Rays(rays.origins[part], rays.directions[part])
-        out = model.render_rays(scene.parts, inputs, chunk, 0, None, prune)
+        out = model.render_rays(bodies, inputs, chunk, 0, None, prune)
         color[index[part]] = out.color
         opacity[index[part]] = out.opacity
         depth[index[part]] = out.depth

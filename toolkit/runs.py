@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -16,17 +17,70 @@ from .config import Config, from_json, to_json
 from .environment import environment_facts
 
 
+def is_free(out: Path) -> bool:
+    """Whether a run can be made here: nothing, or an empty folder."""
+    return not out.exists() or (out.is_dir() and not any(out.iterdir()))
+
+
+def check_free(out: Path) -> None:
+    """Refuse a folder that holds something.
+
+    Raises:
+        InputError: the path exists and is not an empty folder.
+    """
+    if not is_free(out):
+        found = "one with files" if out.is_dir() else "a file"
+        raise InputError(
+            f"--out {out}: expected a new or empty folder, found {found}; "
+            "name another folder or remove this one"
+        )
+
+
+def next_free(out: Path) -> Path:
+    """The path itself where it is free, else the first free one of out-2, out-3, ..."""
+    count, path = 1, out
+    while not is_free(path):
+        count += 1
+        path = out.with_name(f"{out.name}-{count}")
+    return path
+
+
+def read_facts(path: Path) -> dict[str, Any]:
+    """The JSON object of a file of a run folder.
+
+    Args:
+        path: the file.
+
+    Raises:
+        InputError: no file, or one that holds no JSON object.
+    """
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a file of a run, found none; restore it") from None
+    except ValueError as error:
+        raise InputError(f"{path}: expected JSON, found {error}; restore the file") from None
+    if not isinstance(facts, dict):
+        found = type(facts).__name__
+        raise InputError(f"{path}: expected a JSON object, found {found}; restore the file")
+    return facts
+
+
 def create_run(out: Path, config: Config, record: CaptureRecord) -> Path:
     """Make the folder of a new run with its config.json, capture.json and environment.json.
+
+    Args:
+        out: folder to make.
+        config: the resolved configuration.
+        record: the capture.
+
+    Returns:
+        `out`.
 
     Raises:
         InputError: the folder exists and is not empty, or cannot be made.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(
-            f"--out {out}: expected a new or empty folder, found one with files; "
-            "name another folder or remove this one"
-        )
+    check_free(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -44,6 +98,9 @@ def open_run(run: Path, capture: Path | None = None) -> Avatar:
         run: folder that ``monopart train`` made.
         capture: the capture if it has moved.
 
+    Returns:
+        The avatar, ready to render.
+
     Raises:
         InputError: something is missing or does not fit.
     """
@@ -57,10 +114,23 @@ def open_run(run: Path, capture: Path | None = None) -> Avatar:
     config = from_json(run / "config.json")
     params = None
     if (run / "capture.json").is_file():
-        stored = json.loads((run / "capture.json").read_text(encoding="utf-8"))
-        capture, params = capture or Path(stored["path"]), stored["params"]
+        stored = read_facts(run / "capture.json")
+        path, params = stored.get("path"), stored.get("params")
+        if not (isinstance(path, str) and isinstance(params, str)):
+            raise InputError(
+                f"{run / 'capture.json'}: expected texts path and params, found {stored}; "
+                "restore the file"
+            )
+        capture = capture or Path(path)
     if capture is None:
-        raise InputError(f"{run / 'capture.json'}: found no file; name the capture by --capture")
+        raise InputError(
+            f"{run / 'capture.json'}: expected the file that names the capture, found none; "
+            "name the capture by --capture"
+        )
+    if not capture.is_dir():
+        raise InputError(
+            f"{capture}: expected the capture of {run}, found nothing; name it by --capture"
+        )
     record = read_capture(capture, params=params)
     torch.manual_seed(config.seed)
     avatar = Avatar.create(record, config)

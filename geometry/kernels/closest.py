@@ -17,7 +17,7 @@ def closest_on_mesh(
     face: wp.array(dtype=wp.int32),
     bary: wp.array(dtype=wp.vec2),
 ):
-    """Face and barycentrics (first two) of the closest surface point; face -1 beyond max_distance."""
+    """Face and first two barycentrics of the closest point; face -1 beyond max_distance."""
     i = start + wp.tid()
     query = wp.mesh_query_point_no_sign(mesh, points[i], max_distance)
     if query.result:
@@ -48,7 +48,7 @@ def closest_on_parts(
     for k in range(meshes.shape[1]):
         found = int(-1)
         uv = wp.vec2(0.0, 0.0)
-        if (mask >> k) & 1:
+        if (mask >> k) & 1 and meshes[b, k] != wp.int64(0):  # 0: a part without faces
             query = wp.mesh_query_point_no_sign(wp.uint64(meshes[b, k]), p, radius[k])
             if query.result:
                 found = query.face
@@ -83,10 +83,10 @@ def unskin_pairs(
     uv: wp.array(dtype=wp.vec2),
     valid: wp.array(dtype=wp.bool),
 ):
-    """c = B(w) A(w)^-1 p with weights interpolated on the face, and the face-corner UV of the hit.
+    """Canonical point B(w) A(w)^-1 p, weights interpolated on the face, and the UV of the hit.
 
-    The blended maps are linear in the weights and the weights are linear on a face, so that mixing the maps
-    of the three corners is exact.
+    The blended maps are linear in the weights and the weights are linear on a face, so that mixing
+    the maps of the three corners is exact.
     """
     i = start + wp.tid()
     s = sample[i]

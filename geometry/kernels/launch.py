@@ -1,11 +1,13 @@
 """Warp launches over torch tensors: the only file that knows threads, streams and interop.
 
-A Warp kernel runs on one thread on the CPU and releases the GIL, so a launch over ``count`` items is cut into
-chunks for a small pool. Kernels that are launched here take ``start: int`` as their first argument and work on
-item ``start + wp.tid()``. On CUDA one launch goes to torch's current stream, with no host synchronisation.
+A Warp kernel runs on one thread on the CPU and releases the GIL, so a launch over ``count`` items
+is cut into chunks for a small pool. Kernels that are launched here take ``start: int`` as their
+first argument and work on item ``start + wp.tid()``. On CUDA one launch goes to torch's current
+stream, with no host synchronisation.
 """
 
 import functools
+import itertools
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -61,15 +63,14 @@ def init() -> None:
     if _READY:
         return
     with _LOCK:
-        wp.config.log_level = wp.LOG_ERROR  # no banner, no word about a missing CUDA driver
+        # no banner; the native library's own line about a missing CUDA driver has no switch
+        wp.config.log_level = wp.LOG_ERROR
         wp.init()
         wp.config.log_level = wp.LOG_WARNING
         _READY.append(True)
 
 
-def launch(
-    kernel: Any, count: int, args: list[Any], like: Tensor, smallest: int = _SMALL
-) -> None:
+def launch(kernel: Any, count: int, args: list[Any], like: Tensor, smallest: int = _SMALL) -> None:
     """Run ``kernel`` over ``count`` items on the device of ``like``.
 
     Args:
@@ -91,9 +92,7 @@ def launch(
         wp.launch(kernel, dim=count, inputs=[0, *args], device="cpu")
         return
     cuts = [count * i // threads for i in range(threads + 1)]
-    _run_side_by_side(
-        kernel, [(b - a, [a, *args]) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
-    )
+    _run_side_by_side(kernel, [(b - a, [a, *args]) for a, b in itertools.pairwise(cuts)])
 
 
 def _run_side_by_side(kernel: Any, jobs: list[tuple[int, list[Any]]]) -> None:
@@ -115,7 +114,7 @@ def _run_side_by_side(kernel: Any, jobs: list[tuple[int, list[Any]]]) -> None:
 def launch_jobs(kernel: Any, jobs: list[list[Any]], count: int, like: Tensor) -> None:
     """Run one launch of ``count`` items per argument list, side by side on the CPU.
 
-    The jobs must write to disjoint memory: this is how scatter kernels stay deterministic without atomics.
+    The jobs must write to disjoint memory: so scatter kernels stay deterministic without atomics.
 
     Args:
         kernel: a Warp kernel whose first argument is ``start: int``.

@@ -176,6 +176,39 @@ def fill_samples(
 
 
 @no_type_check
+@wp.func
+def cell_at(p: wp.vec3, n: wp.vec3i):
+    """Voxel of a point in voxel units, clamped to the grid."""
+    return wp.vec3i(
+        wp.clamp(int(wp.floor(p[0])), 0, n[0] - 1),
+        wp.clamp(int(wp.floor(p[1])), 0, n[1] - 1),
+        wp.clamp(int(wp.floor(p[2])), 0, n[2] - 1),
+    )
+
+
+@no_type_check
+@wp.func
+def exit_of(o: float, d: float, lo: float, voxel: float, cell: int):
+    """Distance at which a ray leaves the slab of a voxel along one axis."""
+    if wp.abs(d) < 1.0e-12:
+        return 1.0e30
+    if d > 0.0:
+        return (lo + float(cell + 1) * voxel - o) / d
+    return (lo + float(cell) * voxel - o) / d
+
+
+@no_type_check
+@wp.func
+def axis_of_least(v: wp.vec3):
+    """Index of the smallest component, the first of equals."""
+    if v[0] <= v[1] and v[0] <= v[2]:
+        return 0
+    if v[1] <= v[2]:
+        return 1
+    return 2
+
+
+@no_type_check
 @wp.kernel
 def ray_intervals(
     start: int,
@@ -193,61 +226,40 @@ def ray_intervals(
 ):
     """First and last distance at which a ray is inside an occupied voxel, by grid traversal.
 
-    Amanatides and Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, 1987.
+    Amanatides and Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, 1987; the planes are
+    computed from the voxel's index and not summed up, so that no error accumulates.
     """
     i = start + wp.tid()
     b = body[i]
     o = origins[i]
     d = directions[i]
     n = dims[b]
-    span = span_of(o, d, lo[b], n, voxel)
-    near[i] = 0.0
-    far[i] = 0.0
-    hit[i] = False
-    if span[1] <= span[0]:
-        return
-    entry = (o + d * span[0] - lo[b]) / voxel
-    cell = wp.vec3i(
-        wp.clamp(int(wp.floor(entry[0])), 0, n[0] - 1),
-        wp.clamp(int(wp.floor(entry[1])), 0, n[1] - 1),
-        wp.clamp(int(wp.floor(entry[2])), 0, n[2] - 1),
-    )
-    nxt = wp.vec3(1.0e30, 1.0e30, 1.0e30)
-    pace = wp.vec3(1.0e30, 1.0e30, 1.0e30)
-    go = wp.vec3i(0, 0, 0)
-    for a in range(3):
-        if wp.abs(d[a]) > 1.0e-12:
-            pace[a] = voxel / wp.abs(d[a])
-            if d[a] > 0.0:
-                go[a] = 1
-                nxt[a] = (lo[b][a] + float(cell[a] + 1) * voxel - o[a]) / d[a]
-            else:
-                go[a] = -1
-                nxt[a] = (lo[b][a] + float(cell[a]) * voxel - o[a]) / d[a]
-    t = span[0]
+    corner = lo[b]
+    span = span_of(o, d, corner, n, voxel)
     found = bool(False)
     first = float(0.0)
     last = float(0.0)
-    steps = n[0] + n[1] + n[2] + 3
-    inside = bool(True)
-    while inside and steps > 0:
-        steps -= 1
-        axis = int(0)
-        if nxt[1] < nxt[axis]:
-            axis = 1
-        if nxt[2] < nxt[axis]:
-            axis = 2
-        leave = wp.min(nxt[axis], span[1])
-        if grid[offset[b] + wp.int64((cell[2] * n[1] + cell[1]) * n[0] + cell[0])] != 0:
-            if not found:
-                first = t
-                found = True
-            last = leave
-        t = leave
-        cell[axis] = cell[axis] + go[axis]
-        nxt[axis] = nxt[axis] + pace[axis]
-        if cell[axis] < 0 or cell[axis] >= n[axis] or t >= span[1]:
-            inside = False
+    if span[1] > span[0]:
+        cell = cell_at((o + d * span[0] - corner) / voxel, n)
+        leaves = wp.vec3(
+            exit_of(o[0], d[0], corner[0], voxel, cell[0]),
+            exit_of(o[1], d[1], corner[1], voxel, cell[1]),
+            exit_of(o[2], d[2], corner[2], voxel, cell[2]),
+        )
+        t = span[0]
+        inside = bool(True)
+        while inside:
+            axis = axis_of_least(leaves)
+            leave = wp.max(wp.min(leaves[axis], span[1]), t)
+            if grid[offset[b] + wp.int64((cell[2] * n[1] + cell[1]) * n[0] + cell[0])] != 0:
+                if not found:
+                    first = t
+                    found = True
+                last = leave
+            t = leave
+            cell[axis] = cell[axis] + wp.where(d[axis] > 0.0, 1, -1)
+            leaves[axis] = exit_of(o[axis], d[axis], corner[axis], voxel, cell[axis])
+            inside = cell[axis] >= 0 and cell[axis] < n[axis] and t < span[1]
     near[i] = first
     far[i] = last
     hit[i] = found

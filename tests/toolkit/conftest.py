@@ -3,4 +3,26 @@
 import sys
 from pathlib import Path
 
+import pytest
+
+from monopart.toolkit import cli
+
 sys.path.insert(0, str(Path(__file__).parent))
+
+from miniature import write_miniature
+from training import TINY
+
+
+@pytest.fixture(scope="session")
+def small_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture of 48 pixels and 4 frames; not to be changed."""
+    return write_miniature(tmp_path_factory.mktemp("capture") / "small", size=48)
+
+
+@pytest.fixture(scope="session")
+def trained_run(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three iterations on `small_capture`, made by the program; not to be changed."""
+    run = tmp_path_factory.mktemp("runs") / "run"
+    command = ["train", str(small_capture), "--out", str(run), "--preset", "tiny"]
+    assert cli.main([*command, "--iterations", "3", "--explain", "--set", *TINY]) is None
+    return run

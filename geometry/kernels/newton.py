@@ -1,0 +1,402 @@
+"""Warp kernels of inverse skinning: near-face lists, first guesses, and the whole solve of a point in one thread."""
+
+from typing import no_type_check
+
+import warp as wp
+
+from .shell import voxel_of
+
+wp.set_module_options(
+    {"enable_backward": False}
+)  # gradients come from the implicit function theorem
+
+_KEY = wp.constant(wp.int64(1 << 32))
+
+
+@no_type_check
+@wp.func
+def segment(p: wp.vec3, a: wp.vec3, b: wp.vec3):
+    """Parameter in [0, 1] of the point of a segment nearest to a point."""
+    e = b - a
+    square = wp.dot(e, e)
+    t = float(0.0)
+    if square > 0.0:
+        t = wp.clamp(wp.dot(p - a, e) / square, 0.0, 1.0)
+    return t
+
+
+@no_type_check
+@wp.func
+def bary_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Barycentrics of the nearest point of a triangle; exact zeros on edges and corners."""
+    ab = b - a
+    ac = c - a
+    ap = p - a
+    d00 = wp.dot(ab, ab)
+    d01 = wp.dot(ab, ac)
+    d11 = wp.dot(ac, ac)
+    d20 = wp.dot(ap, ab)
+    d21 = wp.dot(ap, ac)
+    det = d00 * d11 - d01 * d01
+    v = d11 * d20 - d01 * d21
+    w = d00 * d21 - d01 * d20
+    if det > 5.0e-7 * d00 * d11 and v >= 0.0 and w >= 0.0 and v + w <= det:
+        return wp.vec3(1.0 - (v + w) / det, v / det, w / det)
+    s = segment(p, a, b)
+    t = segment(p, a, c)
+    u = segment(p, b, c)
+    gap_s = wp.length_sq(ap - ab * s)
+    gap_t = wp.length_sq(ap - ac * t)
+    gap_u = wp.length_sq(p - b - (c - b) * u)
+    if gap_s <= gap_t and gap_s <= gap_u:
+        return wp.vec3(1.0 - s, s, 0.0)
+    if gap_t <= gap_u:
+        return wp.vec3(1.0 - t, 0.0, t)
+    return wp.vec3(0.0, 1.0 - u, u)
+
+
+@no_type_check
+@wp.func
+def gap_to_face(p: wp.vec3, tris: wp.array2d(dtype=wp.vec3), f: int):
+    """Distance to one triangle."""
+    a = tris[f, 0]
+    b = tris[f, 1]
+    c = tris[f, 2]
+    w = bary_on_triangle(p, a, b, c)
+    return wp.length(p - a * w[0] - b * w[1] - c * w[2])
+
+
+@no_type_check
+@wp.func
+def centre_of(cell: int, lo: wp.vec3, dims: wp.vec3i, voxel: float):
+    """Centre of a voxel."""
+    x = cell % dims[0]
+    y = (cell // dims[0]) % dims[1]
+    z = cell // (dims[0] * dims[1])
+    return lo + wp.vec3(float(x) + 0.5, float(y) + 0.5, float(z) + 0.5) * voxel
+
+
+@no_type_check
+@wp.kernel
+def mark_near(
+    start: int,
+    mesh: wp.uint64,
+    lo: wp.vec3,
+    dims: wp.vec3i,
+    voxel: float,
+    reach: float,
+    near: wp.array(dtype=wp.bool),
+):
+    """Voxels whose centre is within ``reach`` of the surface."""
+    i = start + wp.tid()
+    query = wp.mesh_query_point_no_sign(mesh, centre_of(i, lo, dims, voxel), reach)
+    near[i] = query.result
+
+
+@no_type_check
+@wp.kernel
+def list_faces(
+    start: int,
+    mesh: wp.uint64,
+    tris: wp.array2d(dtype=wp.vec3),
+    cells: wp.array(dtype=wp.int32),
+    lo: wp.vec3,
+    dims: wp.vec3i,
+    voxel: float,
+    face: wp.array2d(dtype=wp.int32),
+    gap: wp.array2d(dtype=wp.float32),
+):
+    """The faces that can be the closest of any point of a voxel, nearest to its centre first.
+
+    A row that is not full is complete and ends with -1; a full row holds the nearest ones.
+    """
+    i = start + wp.tid()
+    c = centre_of(cells[i], lo, dims, voxel)
+    query = wp.mesh_query_point_no_sign(mesh, c, 1.0e10)
+    limit = gap_to_face(c, tris, query.face) + 1.7321 * voxel + 1.0e-5
+    side = wp.vec3(limit, limit, limit)
+    boxes = wp.mesh_query_aabb(mesh, c - side, c + side)
+    f = int(0)
+    count = int(0)
+    size = face.shape[1]
+    while wp.mesh_query_aabb_next(boxes, f):
+        d = gap_to_face(c, tris, f)
+        if d <= limit and (count < size or d < gap[i, size - 1]):
+            k = wp.min(count, size - 1)
+            while k > 0 and gap[i, wp.max(k - 1, 0)] > d:
+                gap[i, k] = gap[i, k - 1]
+                face[i, k] = face[i, k - 1]
+                k -= 1
+            gap[i, k] = d
+            face[i, k] = f
+            count += 1
+
+
+@no_type_check
+@wp.func
+def closest_face(
+    p: wp.vec3,
+    mesh: wp.uint64,
+    tris: wp.array2d(dtype=wp.vec3),
+    lo: wp.vec3,
+    dims: wp.vec3i,
+    voxel: float,
+    slots: wp.array(dtype=wp.int32),
+    near_face: wp.array2d(dtype=wp.int32),
+    near_gap: wp.array2d(dtype=wp.float32),
+    max_distance: float,
+):
+    """Closest face by the list of the voxel, exact by the triangle inequality; else by the tree."""
+    best = int(-1)
+    best_gap = max_distance
+    proven = bool(False)
+    cell = voxel_of(p, lo, dims, 1.0 / voxel)
+    if cell >= 0:
+        slot = slots[cell]
+        if slot >= 0:
+            away = wp.length(p - centre_of(cell, lo, dims, voxel)) + 1.0e-6
+            size = near_face.shape[1]
+            k = int(0)
+            while k < size and not proven:
+                f = near_face[slot, k]
+                if f < 0 or near_gap[slot, k] - away > best_gap:
+                    proven = True
+                else:
+                    d = gap_to_face(p, tris, f)
+                    if d < best_gap:
+                        best_gap = d
+                        best = f
+                    k += 1
+    if not proven:
+        query = wp.mesh_query_point_no_sign(mesh, p, best_gap)
+        if query.result:
+            best = query.face
+    return best
+
+
+@no_type_check
+@wp.kernel
+def splat_verts(
+    start: int,
+    verts: wp.array(dtype=wp.vec3),
+    frame: wp.array(dtype=wp.float32),
+    size: int,
+    reach: float,
+    nearest: wp.array(dtype=wp.int64),
+):
+    """Nearest vertex of every voxel centre within ``reach`` voxels; the key is (distance, vertex)."""
+    i = start + wp.tid()
+    lo = wp.vec3(frame[0], frame[1], frame[2])
+    p = (verts[i] - lo) / frame[3] - wp.vec3(0.5, 0.5, 0.5)
+    x0 = wp.max(int(wp.ceil(p[0] - reach)), 0)
+    y0 = wp.max(int(wp.ceil(p[1] - reach)), 0)
+    z0 = wp.max(int(wp.ceil(p[2] - reach)), 0)
+    x1 = wp.min(int(wp.floor(p[0] + reach)), size - 1)
+    y1 = wp.min(int(wp.floor(p[1] + reach)), size - 1)
+    z1 = wp.min(int(wp.floor(p[2] + reach)), size - 1)
+    for z in range(z0, z1 + 1):
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                d = wp.length_sq(p - wp.vec3(float(x), float(y), float(z)))
+                if d <= reach * reach:
+                    key = wp.int64(d * 1.0e6) * _KEY + wp.int64(i)
+                    wp.atomic_min(nearest, (z * size + y) * size + x, key)
+
+
+@no_type_check
+@wp.kernel
+def first_guess(
+    start: int,
+    points: wp.array(dtype=wp.vec3),
+    frame: wp.array(dtype=wp.float32),
+    size: int,
+    nearest: wp.array(dtype=wp.int64),
+    mesh: wp.uint64,
+    faces: wp.array(dtype=wp.vec3i),
+    max_distance: float,
+    rest: wp.array(dtype=wp.vec3),
+    skinned: wp.array(dtype=wp.vec3),
+    inverse: wp.array2d(dtype=wp.vec3),
+    guess: wp.array(dtype=wp.vec3),
+    known: wp.array(dtype=wp.bool),
+):
+    """Rest point by the local inverse of the vertex that the voxel names, or of the closest face."""
+    i = start + wp.tid()
+    x = points[i]
+    lo = wp.vec3(frame[0], frame[1], frame[2])
+    cell = voxel_of(x, lo, wp.vec3i(size, size, size), 1.0 / frame[3])
+    v = int(-1)
+    if cell >= 0:
+        key = nearest[cell]
+        if key >= wp.int64(0):
+            v = int(key % _KEY)
+    if v < 0:
+        query = wp.mesh_query_point_no_sign(mesh, x, max_distance)
+        if query.result:
+            corner = faces[query.face]
+            v = corner[2]
+            if query.u >= query.v and query.u >= 1.0 - query.u - query.v:
+                v = corner[0]
+            elif query.v >= 1.0 - query.u - query.v:
+                v = corner[1]
+    known[i] = v >= 0
+    p = x
+    if v >= 0:
+        e = x - skinned[v]
+        p = rest[v] + wp.vec3(
+            wp.dot(inverse[v, 0], e), wp.dot(inverse[v, 1], e), wp.dot(inverse[v, 2], e)
+        )
+    guess[i] = p
+
+
+@no_type_check
+@wp.func
+def bary_gradients(w: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Gradients of the last two barycentrics of the closest point (the first is minus their sum)."""
+    gb = wp.vec3(0.0, 0.0, 0.0)
+    gc = wp.vec3(0.0, 0.0, 0.0)
+    ab = b - a
+    ac = c - a
+    if w[0] > 0.0 and w[1] > 0.0 and w[2] > 0.0:
+        d00 = wp.dot(ab, ab)
+        d01 = wp.dot(ab, ac)
+        d11 = wp.dot(ac, ac)
+        det = wp.max(d00 * d11 - d01 * d01, 1.0e-30)
+        gb = (ab * d11 - ac * d01) / det
+        gc = (ac * d00 - ab * d01) / det
+    elif w[0] > 0.0 and w[1] > 0.0:
+        gb = ab / wp.max(wp.dot(ab, ab), 1.0e-30)
+    elif w[0] > 0.0 and w[2] > 0.0:
+        gc = ac / wp.max(wp.dot(ac, ac), 1.0e-30)
+    elif w[1] > 0.0 and w[2] > 0.0:
+        bc = c - b
+        gc = bc / wp.max(wp.dot(bc, bc), 1.0e-30)
+        gb = -gc
+    return gb, gc
+
+
+@no_type_check
+@wp.func
+def solve_rows(r0: wp.vec3, r1: wp.vec3, r2: wp.vec3, e: wp.vec3):
+    """Step of a 3x3 system given by its rows, and its determinant; unscaled where that is 0."""
+    c0 = wp.cross(r1, r2)
+    det = wp.dot(r0, c0)
+    step = c0 * e[0] + wp.cross(r2, r0) * e[1] + wp.cross(r0, r1) * e[2]
+    if det != 0.0:
+        step = step / det
+    return step, det
+
+
+@no_type_check
+@wp.func
+def affine(maps: wp.array2d(dtype=wp.vec4), v: int, h: wp.vec4):
+    """A point under the map of one vertex."""
+    return wp.vec3(wp.dot(maps[v, 0], h), wp.dot(maps[v, 1], h), wp.dot(maps[v, 2], h))
+
+
+@no_type_check
+@wp.func
+def blended_row(maps: wp.array2d(dtype=wp.vec4), row: int, v: wp.vec3i, w: wp.vec3):
+    """Linear part of row ``row`` of the maps of three vertices, mixed with barycentrics."""
+    m = maps[v[0], row] * w[0] + maps[v[1], row] * w[1] + maps[v[2], row] * w[2]
+    return wp.vec3(m[0], m[1], m[2])
+
+
+@no_type_check
+@wp.kernel
+def solve(
+    start: int,
+    points: wp.array(dtype=wp.vec3),
+    guess: wp.array(dtype=wp.vec3),
+    mesh: wp.uint64,
+    tris: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    lo: wp.vec3,
+    dims: wp.vec3i,
+    voxel: float,
+    slots: wp.array(dtype=wp.int32),
+    near_face: wp.array2d(dtype=wp.int32),
+    near_gap: wp.array2d(dtype=wp.float32),
+    maps: wp.array2d(dtype=wp.vec4),
+    weights: wp.array2d(dtype=wp.float32),
+    iterations: int,
+    gradients: int,
+    stop: float,
+    min_det: float,
+    max_distance: float,
+    rest: wp.array(dtype=wp.vec3),
+    blend: wp.array2d(dtype=wp.float32),
+    face: wp.array(dtype=wp.int32),
+    residual: wp.array(dtype=wp.float32),
+    invertible: wp.array(dtype=wp.bool),
+):
+    """Solve x = A(w(p)) p from a guess: Newton steps, or re-queries where ``gradients`` is 0."""
+    i = start + wp.tid()
+    x = points[i]
+    p = guess[i]
+    best_p = p
+    best_w = wp.vec3(0.0, 0.0, 0.0)
+    best_face = int(-1)
+    best = float(1.0e30)
+    best_ok = bool(False)
+    k = int(0)
+    while k <= iterations:
+        f = closest_face(p, mesh, tris, lo, dims, voxel, slots, near_face, near_gap, max_distance)
+        k += 1
+        if f < 0:
+            k = iterations + 1
+        else:
+            a = tris[f, 0]
+            b = tris[f, 1]
+            c = tris[f, 2]
+            w = bary_on_triangle(p, a, b, c)
+            v = faces[f]
+            h = wp.vec4(p[0], p[1], p[2], 1.0)
+            ya = affine(maps, v[0], h)
+            yb = affine(maps, v[1], h)
+            yc = affine(maps, v[2], h)
+            e = x - ya * w[0] - yb * w[1] - yc * w[2]
+            r = wp.length(e)
+            r0 = blended_row(maps, 0, v, w)
+            r1 = blended_row(maps, 1, v, w)
+            r2 = blended_row(maps, 2, v, w)
+            step, det = solve_rows(r0, r1, r2, e)
+            ok = wp.abs(det) > min_det
+            if r < best:
+                best = r
+                best_p = p
+                best_w = w
+                best_face = f
+                best_ok = ok
+            if r <= stop:
+                k = iterations + 1
+            else:
+                if gradients != 0:
+                    gb, gc = bary_gradients(w, a, b, c)
+                    db = yb - ya
+                    dc = yc - ya
+                    r0 += gb * db[0] + gc * dc[0]
+                    r1 += gb * db[1] + gc * dc[1]
+                    r2 += gb * db[2] + gc * dc[2]
+                    full, full_det = solve_rows(r0, r1, r2, e)
+                    if wp.abs(full_det) > min_det:
+                        step = full
+                        ok = True
+                size = wp.length(step)
+                if not ok or not (size < 1.0e6):
+                    k = iterations + 1
+                elif size > 0.2:
+                    step = step * (0.2 / size)
+                p = p + step
+    rest[i] = best_p
+    face[i] = best_face
+    residual[i] = best
+    invertible[i] = best_ok
+    if best_face >= 0:
+        v = faces[best_face]
+        for j in range(weights.shape[1]):
+            blend[i, j] = (
+                weights[v[0], j] * best_w[0]
+                + weights[v[1], j] * best_w[1]
+                + weights[v[2], j] * best_w[2]
+            )

