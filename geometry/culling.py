@@ -39,6 +39,25 @@ class ShellSamples:
     ray_start: Int[Tensor, "r1"]
     dense: int
 
+    def rows(self, keep: Bool[Tensor, "m"]) -> "ShellSamples":
+        """The samples of a mask, over the same rays and in the same order.
+
+        Args:
+            keep: True for the samples to keep.
+        """
+        before = torch.cat([self.ray_start.new_zeros(1), keep.long().cumsum(0)])
+        kept = before[self.ray_start]
+        index = torch.nonzero(keep).squeeze(-1)
+        return ShellSamples(
+            self.points[index],
+            self.depth[index],
+            self.ray[index],
+            self.body[index],
+            self.candidates[index],
+            kept,
+            self.dense,
+        )
+
 
 def _vertex_reach(verts: Tensor, faces: Tensor) -> Tensor:
     """Per vertex, how far a point of its triangles may be from the nearest corner, over all bodies.

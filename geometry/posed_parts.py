@@ -215,7 +215,7 @@ class PosedParts:
         local = face[part, rows]
         found = local >= 0
         first = torch.tensor(self._first, device=self.device)
-        index = self._order[first[part] + local.clamp(min=0).long()]
+        index = self._order[(first[part] + local) * found]
         two = bary[part, rows]
         full = torch.cat([two, 1.0 - two.sum(-1, keepdim=True)], -1)
         uv = (full[..., None] * self.corner_uv[index]).sum(-2)

@@ -190,6 +190,11 @@ class SkinningField:
         return self._lists
 
 
+def _mesh_id(index: SurfaceIndex) -> Any:
+    """Warp's handle of the mesh of an index with the warp back end."""
+    return index._mesh.id  # type: ignore[union-attr]
+
+
 def _build_lists(field: SkinningField) -> dict[str, Any]:
     from .kernels.launch import launch, view
     from .kernels.newton import list_faces, mark_near
@@ -205,14 +210,15 @@ def _build_lists(field: SkinningField) -> dict[str, Any]:
     dims = tuple(((high - low) / voxel).ceil().int().tolist())
     count = math.prod(dims)
     near = torch.zeros(count, dtype=torch.bool, device=rest.device)
-    mesh = field.index.mesh_id
+    mesh = _mesh_id(field.index)
     launch(mark_near, count, [mesh, lo, dims, voxel, reach, view(near)], rest)
     cells = near.nonzero().squeeze(-1)
     slots = torch.full((count,), -1, dtype=torch.int32, device=rest.device)
     slots[cells] = torch.arange(len(cells), dtype=torch.int32, device=rest.device)
     face = torch.full((len(cells), _LISTED), -1, dtype=torch.int32, device=rest.device)
     gap = torch.zeros(len(cells), _LISTED, device=rest.device)
-    args = [mesh, view(tris, 3), view(cells.int()), lo, dims, voxel, view(face), view(gap)]
+    cells = cells.int()
+    args = [mesh, view(tris, 3), view(cells), lo, dims, voxel, view(face), view(gap)]
     launch(list_faces, len(cells), args, rest)
     return {
         "tris": tris,
@@ -241,7 +247,7 @@ def guess_warp(
 ) -> tuple[Tensor, Tensor]:
     """First guesses [N, 3] by a voxel look-up of the nearest posed vertex, and where there is one."""
     from .kernels.launch import launch, launch_one, view
-    from .kernels.newton import first_guess, splat_verts
+    from .kernels.newton import EMPTY, first_guess, splat_verts
 
     count, lists = len(points), field.near_lists()
     skinned, inverse = vertex_inverses(field, maps)
@@ -250,14 +256,109 @@ def guess_warp(
     # the reach is kept free around the body; frame = corner and voxel size, which stay on the device
     voxel = ((high - low).amax() / (_GRID - 2 * math.ceil(_SPLAT))).clamp(min=1e-3)
     frame = torch.cat([low - math.ceil(_SPLAT) * voxel, voxel[None]])
-    nearest = torch.full((_GRID**3,), torch.iinfo(torch.int64).max, device=points.device)
+    nearest = torch.full((_GRID**3,), EMPTY, device=points.device)
     args = [view(skinned, 3), view(frame), _GRID, _SPLAT, view(nearest)]
     launch_one(splat_verts, len(skinned), args, points)
     posed = field.posed_index(skinned)
     guess = torch.zeros_like(points)
     known = torch.zeros(count, dtype=torch.bool, device=points.device)
     rest = field.rest.detach().contiguous()
-    args = [view(points, 3), view(frame), _GRID, view(nearest), posed.mesh_id]
+    args = [view(points, 3), view(frame), _GRID, view(nearest), _mesh_id(posed)]
     args += [view(lists["faces"], 3), min(2 * max_distance, 1e10), view(rest, 3), view(skinned, 3)]
     launch(first_guess, count, [*args, view(inverse, 3), view(guess, 3), view(known)], points)
     return guess, known
+
+
+def newton_warp(
+    field: SkinningField,
+    points: Tensor,
+    maps: Tensor,
+    guess: Tensor,
+    iterations: int,
+    max_distance: float,
+    gradients: bool = True,
+) -> tuple[Roots, Tensor]:
+    """All iterations of every point in one kernel: Newton, or re-queries without ``gradients``.
+
+    Args:
+        field: the forward field, with the warp back end.
+        points: [N, 3] float32 targets in pose space, finite.
+        maps: [V, 3, 4] float32 blended maps of the vertices.
+        guess: [N, 3] first rest points.
+        iterations: steps.
+        max_distance: rest points farther than this from the surface end the search, metres.
+        gradients: whether the Jacobian has the term of the changing weights.
+
+    Returns:
+        The roots, and their weights [N, J].
+    """
+    from .kernels.launch import launch, view
+    from .kernels.newton import solve
+
+    count, device, lists = len(points), points.device, field.near_lists()
+    rest = torch.zeros_like(points)
+    weights = torch.zeros(count, field.weights.shape[1], device=device)
+    face = torch.zeros(count, dtype=torch.int32, device=device)
+    residual = torch.zeros(count, device=device)
+    invertible = torch.zeros(count, dtype=torch.bool, device=device)
+    args = [view(points, 3), view(guess, 3), _mesh_id(field.index), view(lists["tris"], 3)]
+    args += [view(lists["faces"], 3), lists["lo"], lists["dims"], lists["voxel"]]
+    args += [view(lists["slots"]), view(lists["face"]), view(lists["gap"]), view(maps, 4)]
+    args += [view(lists["weights"]), iterations, int(gradients), STOP, MIN_DET]
+    out = [view(rest, 3), view(weights), view(face), view(residual), view(invertible)]
+    launch(solve, count, [*args, min(max_distance, 1e10), *out], points)
+    residual = torch.where(face >= 0, residual, math.inf)
+    return Roots(rest, face.clamp(min=0).long(), residual, invertible), weights
+
+
+def newton_torch(
+    field: SkinningField,
+    points: Tensor,
+    maps: Tensor,
+    guess: Tensor,
+    iterations: int,
+    max_distance: float,
+    gradients: bool = True,
+) -> Roots:
+    """The plain twin of :func:`newton_warp`, in the dtype of the input; keeps the best iterate."""
+    rest, best = guess.clone(), _start(guess)
+    for step in range(iterations + 1):
+        hit = field.index.query(rest, max_distance)
+        at = field_at(rest, hit.face, field.rest, field.faces, maps)
+        error = points - at.image
+        residual = torch.where(hit.found, error.norm(dim=-1), math.inf)
+        blended_inverse, ok = invert_linear(at.linear, MIN_DET)
+        best = keep_better(best, Roots(rest, hit.face, residual, ok))
+        if step == iterations or bool((best.residual <= STOP).all()):
+            break
+        move = apply_linear(blended_inverse, error)
+        if gradients:
+            inverse, full = invert_linear(field_jacobian(at), MIN_DET)
+            move = torch.where(full[:, None], apply_linear(inverse, error), move)
+            ok = ok | full
+        size = move.norm(dim=-1, keepdim=True)
+        move = move * (LONGEST_STEP / size.clamp(min=LONGEST_STEP))
+        active = ok & hit.found & (best.residual > STOP)
+        rest = torch.where(active[:, None], rest + move, rest)
+    return best
+
+
+def _start(guess: Tensor) -> Roots:
+    count, device = len(guess), guess.device
+    return Roots(
+        guess,
+        torch.zeros(count, dtype=torch.long, device=device),
+        torch.full((count,), math.inf, dtype=guess.dtype, device=device),
+        torch.zeros(count, dtype=torch.bool, device=device),
+    )
+
+
+def keep_better(old: Roots, new: Roots) -> Roots:
+    """Per point the one with the smaller residual; the old one where both are equal."""
+    take = new.residual < old.residual
+    return Roots(
+        torch.where(take[:, None], new.points, old.points),
+        torch.where(take, new.face, old.face),
+        torch.where(take, new.residual, old.residual),
+        torch.where(take, new.invertible, old.invertible),
+    )

@@ -1,9 +1,8 @@
-"""A trained person: model, capture and pose memory together; what rendering and evaluation need."""
+"""A trained person: model, capture and pose memory; what rendering and evaluation need."""
 
 from dataclasses import dataclass
 
 import torch
-
 
 from monopart.geometry.body import BodyPose, PosedBody
 from monopart.geometry.cameras import Camera

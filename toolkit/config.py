@@ -1,4 +1,4 @@
-"""The configuration of a run: frozen, resolved, written as JSON beside it and read back strictly."""
+"""The configuration of a run: frozen, written as JSON beside it and read back strictly."""
 
 import dataclasses
 import json
@@ -47,7 +47,7 @@ class FieldConfig:
     sharpness: float = 100.0
     """Density in 1/m per unit of softplus."""
     prior_slope: float = 200.0
-    """Slope k of the distance prior, 1/m (METHOD section 9); 0 leaves the density to the network."""
+    """Slope k of the distance prior, 1/m; 0 leaves the density to the network."""
     prior_margin: float = 0.015
     """Distance outside the body at which the prior is neutral, metres."""
 

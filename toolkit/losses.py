@@ -32,8 +32,8 @@ def round_trip_distance(
 ) -> Float[Tensor, "m"]:
     """Distance between samples and their forward-deformed canonical points (eq. 3), metres.
 
-    Skinning weights are looked up again at the canonical point; with the weights of the way back the
-    two maps would cancel and the loss would be empty.
+    Skinning weights are looked up again at the canonical point: with the weights of the way back
+    the two maps would cancel and the loss would be empty.
 
     Args:
         model: the avatar, with a forward residual.
@@ -43,10 +43,10 @@ def round_trip_distance(
         out: a rendering of the batch.
         rows: pairs to use, ascending.
     """
-    pairs = out.pairs
+    pairs = out.shaded.pairs
     sample, part = pairs.sample[rows], pairs.part[rows]
     owner = out.samples.body[sample].long()
-    points = out.canonical[rows]
+    points = out.shaded.canonical[rows]
     hit = canonical_parts.on_part(points, part)
     posed_point = bodies.reskin(points, owner, hit, canonical_parts)
     forward: ResidualField | None = model.forward_residual

@@ -37,6 +37,27 @@ class FrameInput:
 
 
 @dataclass(frozen=True)
+class Shaded:
+    """Density and colour of samples, and how they came about.
+
+    Attributes:
+        sigma: [N] density, 1/m.
+        color: [N, 3].
+        pairs: the evaluated (sample, part) pairs.
+        canonical: [M, 3] canonical points of the pairs after the residual.
+        residual: [M, 3] backward residuals, or None.
+        counts: samples, pairs and colours that were evaluated.
+    """
+
+    sigma: Tensor
+    color: Tensor
+    pairs: PartPairs
+    canonical: Tensor
+    residual: Tensor | None
+    counts: dict[str, int]
+
+
+@dataclass(frozen=True)
 class Rendered:
     """Colours of rays and what it took.
 
@@ -45,9 +66,8 @@ class Rendered:
         opacity: [R].
         depth: [R] expected distance along the ray, metres.
         stats: counts of rays, samples and pairs.
-        pairs: the evaluated pairs, for losses.
-        canonical: [M, 3] canonical points of the pairs after the residual.
-        residual: [M, 3] backward residuals, or None.
+        samples: the samples.
+        shaded: their densities and colours.
     """
 
     color: Tensor
@@ -55,9 +75,7 @@ class Rendered:
     depth: Tensor
     stats: dict[str, int]
     samples: ShellSamples
-    pairs: PartPairs
-    canonical: Tensor
-    residual: Tensor | None
+    shaded: Shaded
 
 
 def select(pairs: PartPairs, rows: Tensor, num_parts: int) -> PartPairs:
@@ -148,27 +166,17 @@ class AvatarModel(torch.nn.Module):
         rows = torch.nonzero(keep).squeeze(-1)
         return rows, cell[rows]
 
-    def render_rays(
-        self,
-        bodies: PosedParts,
-        frames: FrameInput,
-        rays: Rays,
-        body: Tensor | int = 0,
-        jitter: Tensor | None = None,
-        prune: float = 0.0,
-    ) -> Rendered:
-        """Colours of rays over black.
+    def shade(
+        self, bodies: PosedParts, frames: FrameInput, samples: ShellSamples, prune: float = 0.0
+    ) -> Shaded:
+        """Density and colour of samples.
 
         Args:
             bodies: posed bodies in their local frames.
             frames: time and code of each body.
-            rays: [R] rays in the local frame of their body.
-            body: body of each ray.
-            jitter: [R] offsets of the sample lattice in steps.
+            samples: samples of rays inside the shell.
             prune: skip canonical cells that absorb less than this per sample; 0 skips none.
         """
-        step = self.config.geometry.step
-        samples = bodies.shell.sample(rays, step, body, jitter)
         pairs = bodies.pairs(samples)
         rest = bodies.unskin(samples, pairs)
         found = len(pairs.sample)
@@ -187,23 +195,49 @@ class AvatarModel(torch.nn.Module):
             self.occupancy.see(cell, sigma)
         total = len(samples.depth)
         union = union_by_density(sigma, pairs.sample, pairs.part, total, self.num_parts)
-        won = pairs.sample[union.winner]
         code = None if frames.code is None else frames.code[owner[union.winner]]
         rgb = self.field.color(encoded[union.winner], geometry[union.winner], code, union.counts)
-        color = torch.zeros(total, 3).to(rgb).index_copy(0, won, rgb)
+        color = torch.zeros(total, 3).to(rgb)
+        color = color.index_copy(0, pairs.sample[union.winner], rgb)
+        counts = {
+            "samples_evaluated": total,
+            "pairs_found": found,
+            "pairs_evaluated": len(pairs.sample),
+            "colors_evaluated": len(union.winner),
+        }
+        return Shaded(union.sigma, color, pairs, canonical, residual, counts)
+
+    def render_rays(
+        self,
+        bodies: PosedParts,
+        frames: FrameInput,
+        rays: Rays,
+        body: Tensor | int = 0,
+        jitter: Tensor | None = None,
+        prune: float = 0.0,
+    ) -> Rendered:
+        """Colours of rays over black, every sample evaluated: the differentiable way.
+
+        Args:
+            bodies: posed bodies in their local frames.
+            frames: time and code of each body.
+            rays: [R] rays in the local frame of their body.
+            body: body of each ray.
+            jitter: [R] offsets of the sample lattice in steps.
+            prune: see :meth:`shade`.
+        """
+        step = self.config.geometry.step
+        samples = bodies.shell.sample(rays, step, body, jitter)
+        shaded = self.shade(bodies, frames, samples, prune)
         delta = torch.full_like(samples.depth, step)
-        out = composite(union.sigma, color, delta, samples.ray_start, samples.depth)
+        out = composite(shaded.sigma, shaded.color, delta, samples.ray_start, samples.depth)
         stats = {
             "rays": len(rays.directions),
             "samples_dense": samples.dense,
-            "samples_shell": total,
-            "pairs_found": found,
-            "pairs_evaluated": len(pairs.sample),
-            "colors_evaluated": len(won),
+            "samples_shell": len(samples.depth),
+            **shaded.counts,
         }
-        return Rendered(
-            out.color, out.opacity, out.depth, stats, samples, pairs, canonical, residual
-        )
+        return Rendered(out.color, out.opacity, out.depth, stats, samples, shaded)
 
 
 def part_boxes(

@@ -11,13 +11,15 @@ from torch import Tensor
 from monopart.geometry.cameras import Rays
 
 from .avatar import Avatar, View
+from .march import march
 from .scene import SceneBodies, shell_pixels
 
-CHUNK = 8192  # rays at a time: bounds the memory
+CHUNK = 16384  # rays at a time: bounds the memory
 STATS = (
     "rays",
     "samples_dense",
     "samples_shell",
+    "samples_evaluated",
     "pairs_found",
     "pairs_evaluated",
     "colors_evaluated",
@@ -58,8 +60,9 @@ def render_view(
         background: grey level behind the person, in [0, 1].
         prune: skip learned empty cells that absorb less than this per sample (approximate); 0 is
             exact.
-        skip: leave out rays and samples outside the body shell (exact); off evaluates every part
-            at every sample in the box of the body: the dense renderer, for comparison.
+        skip: leave out rays and samples outside the body shell (exact) and samples behind an
+            opaque front (within 5e-5); off evaluates every part at every sample in the box of the
+            body: the dense renderer, for comparison.
         scene: the posed body if it exists already.
     """
     model = avatar.model.eval()
@@ -80,7 +83,10 @@ def render_view(
     for start in range(0, len(index), CHUNK):
         part = slice(start, start + CHUNK)
         chunk = Rays(rays.origins[part], rays.directions[part])
-        out = model.render_rays(bodies, inputs, chunk, 0, None, prune)
+        if skip:
+            out = march(model, bodies, inputs, chunk, prune)
+        else:
+            out = model.render_rays(bodies, inputs, chunk, 0, None, prune)
         color[index[part]] = out.color
         opacity[index[part]] = out.opacity
         depth[index[part]] = out.depth
@@ -105,9 +111,12 @@ def render_views(
         progress: called with (done, total).
         prune: see :func:`render_view`.
     """
-    pictures = []
+    pictures: list[Picture] = []
+    scene, pose = None, None
     for done, view in enumerate(views, start=1):
-        pictures.append(render_view(avatar, view, prune=prune))
+        if scene is None or view.pose is not pose:  # a turntable keeps one pose
+            scene, pose = avatar.pose_scene(view.pose), view.pose
+        pictures.append(render_view(avatar, view, prune=prune, scene=scene))
         if progress is not None:
             progress(done, len(views))
     return pictures

@@ -93,7 +93,7 @@ def shell_pixels(camera: Camera, scene: SceneBodies, body: int) -> tuple[Tensor,
     Returns:
         Flat row-major pixel indices and their local rays.
     """
-    height, width = camera.size
+    width = camera.size[1]
     x0, y0, x1, y1 = _screen_box(camera, scene, body)
     ys, xs = torch.meshgrid(torch.arange(y0, y1), torch.arange(x0, x1), indexing="ij")
     pixels = torch.stack([xs, ys], -1).reshape(-1, 2).float() + 0.5

@@ -148,12 +148,12 @@ class Trainer:
 
     def _deformation_terms(self, out: Rendered) -> dict[str, Tensor]:
         spec, terms = self.config.loss, {}
-        if out.residual is None:
+        if out.shaded.residual is None:
             return terms
         if spec.offset:
-            terms["offset"] = spec.offset * offset_loss(out.residual)
+            terms["offset"] = spec.offset * offset_loss(out.shaded.residual)
         if self.canonical is not None and self.avatar.model.forward_residual is not None:
-            count = len(out.pairs.sample)
+            count = len(out.shaded.pairs.sample)
             rows = torch.randint(
                 max(count, 1), (min(spec.consistency_samples, count),), generator=self.generator
             ).sort()[0]

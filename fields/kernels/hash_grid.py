@@ -5,7 +5,7 @@ of ``features`` floats. A mask of 0 marks a level that is stored densely. The ti
 for memory, so a thread asks for the rows of a level two levels before it needs them.
 """
 # a kernel lists its arrays and is one body; int() and float() make Warp variables
-# ruff: noqa: PLR0913, PLR0915, PLR0917, RUF046, UP018
+# ruff: noqa: PLR0915
 
 import functools
 from typing import Any, no_type_check

@@ -1,6 +1,6 @@
 """Warp kernels of compositing: one thread per ray, forward and backward."""
 # a kernel lists its arrays; float() makes Warp variables
-# ruff: noqa: PLR0913, PLR0917, PLR1730, UP018
+# ruff: noqa: PLR1730
 
 from typing import no_type_check
 

@@ -46,11 +46,13 @@ def view(tensor: Tensor, vector: int = 1) -> Any:
         vector: 2, 3 or 4 reads the last axis as one vector (float32 only); 1 keeps scalars.
 
     Returns:
-        A launch argument: an array of the remaining axes.
+        A launch argument: an array of the remaining axes, which keeps the tensor alive.
     """
     init()
     dtype = _VECTOR[tensor.dtype, vector] if vector > 1 else _SCALAR[tensor.dtype]
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    argument = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    argument.tensor = tensor  # Warp's struct holds a bare pointer: a temporary would be freed
+    return argument
 
 
 @functools.cache

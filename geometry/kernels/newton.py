@@ -11,6 +11,8 @@ wp.set_module_options(
 )  # gradients come from the implicit function theorem
 
 _KEY = wp.constant(wp.int64(1 << 32))
+EMPTY = (1 << 63) - 1
+_EMPTY = wp.constant(wp.int64(EMPTY))
 
 
 @no_type_check
@@ -228,7 +230,7 @@ def first_guess(
     v = int(-1)
     if cell >= 0:
         key = nearest[cell]
-        if key >= wp.int64(0):
+        if key < _EMPTY:
             v = int(key % _KEY)
     if v < 0:
         query = wp.mesh_query_point_no_sign(mesh, x, max_distance)

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import weakref
 from collections.abc import Iterator
 from typing import no_type_check
 
@@ -106,6 +107,16 @@ def test_views_share_memory_and_know_vectors() -> None:
         view(torch.zeros(3, dtype=dtype))
     with pytest.raises(KeyError):
         view(torch.zeros(3, 3, dtype=torch.float64), 3)
+
+
+def test_a_view_keeps_its_tensor() -> None:
+    tensor = torch.zeros(1000)
+    alive = weakref.ref(tensor)
+    argument = view(tensor)
+    del tensor
+    assert alive() is not None
+    del argument
+    assert alive() is None
 
 
 def test_starting_warp_prints_no_banner() -> None:

@@ -47,7 +47,7 @@ def test_skipping_does_not_change_the_image(trained: Avatar) -> None:
     assert float((fast.opacity - dense.opacity).abs().max()) <= 1e-4
     assert fast.stats["rays"] < dense.stats["rays"]
     assert fast.stats["samples_shell"] < dense.stats["samples_shell"]
-    assert fast.stats["pairs_found"] == dense.stats["pairs_found"]
+    assert fast.stats["pairs_found"] <= dense.stats["pairs_found"]
 
 
 def test_learned_pruning_changes_the_image_little_and_evaluates_less(capture: Path) -> None:

@@ -4,6 +4,7 @@ TINY = (
     "field.levels=2",
     "field.log2_size=8",
     "field.hidden=16",
+    "field.prior_slope=0",
     "deform.hidden=16",
     "deform.log2_size=8",
     "train.rays=128",

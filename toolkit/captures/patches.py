@@ -55,7 +55,7 @@ class PixelSampler:
         return self._batch(image, self.pixel[pick].long())
 
     def patch(self, size: int, generator: torch.Generator) -> PixelBatch:
-        """A square of one image centred on a random pixel of its mask, row by row.
+        """A square of one image centred in the box of its mask, row by row.
 
         A patch larger than the image is cut to the image.
         """
@@ -63,7 +63,7 @@ class PixelSampler:
         height, width = min(size, self.height), min(size, self.width)
         y0, y1, x0, x1 = self.boxes[image]
         u, v = torch.rand(2, generator=generator).tolist()
-        # Centres anywhere in the box of the mask, so that its borders are seen as often as its middle.
+        # Centres anywhere in the box of the mask: its borders are seen as often as its middle.
         top = min(max(int(y0 + u * (y1 - y0)) - height // 2, 0), self.height - height)
         left = min(max(int(x0 + v * (x1 - x0)) - width // 2, 0), self.width - width)
         ys = torch.arange(top, top + height)[:, None]

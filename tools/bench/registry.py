@@ -1,0 +1,101 @@
+"""What a benchmark is made of: operations, the methods that carry them out, and their problems."""
+
+import importlib
+import importlib.util
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .timing import Effort
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the command line asked for."""
+
+    quick: bool = False
+    """Tiny problems, to see that everything runs; the figures mean nothing."""
+    capture: Path | None = None
+    """A capture whose body poses join the list of poses, or that is trained on."""
+    run: Path | None = None
+    """A trained run, for rendering."""
+    only: tuple[str, ...] = ()
+    """Names of the operations to run; empty for all."""
+    presets: tuple[str, ...] = ()
+    """Presets to train; empty for all."""
+    seconds: float = 240.0
+    """Wall-clock budget of each training, seconds."""
+
+    @property
+    def effort(self) -> Effort:
+        """How often methods are run."""
+        return Effort(1, 1, 0.0) if self.quick else Effort()
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One input on which all methods of an operation are compared."""
+
+    size: int
+    """Number of points, bodies, rays or the like."""
+    setting: str
+    """What else tells the problem from others of the same size."""
+    data: Any
+    """What the methods read."""
+    effort: Effort | None = None
+    """How often methods are run, where it is not the settings' own."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to carry out an operation; a peer says how it is installed and whether it is there."""
+
+    name: str
+    """Shown in tables."""
+    prepare: Callable[[Any], Callable[[], Any]]
+    """Gets the data of a problem, does what is not timed and returns the timed call."""
+    modules: tuple[str, ...] = ()
+    """Top-level modules that must be importable."""
+    install: str = ""
+    """Command that installs them."""
+    ours: bool = False
+    """Whether it is part of monopart."""
+    largest: int | None = None
+    """Problems above this size are left out."""
+    read: Callable[[Any], Any] | None = None
+    """Brings an untimed result into the form that the judge expects."""
+    needs: Callable[[], str | None] | None = None
+    """Another reason for absence, or None."""
+
+    def absent(self) -> str | None:
+        """Why the method cannot run here, with the install line; None where it can."""
+        for name in self.modules:
+            if importlib.util.find_spec(name) is None:
+                return f"not installed; {self.install}"
+        return self.needs() if self.needs is not None else None
+
+
+@dataclass(frozen=True)
+class Operation:
+    """An operation with its methods, problems and measure of error."""
+
+    name: str
+    """Short, for the command line and file names."""
+    title: str
+    """Heading of its table."""
+    error: str
+    """What the error is, with its unit."""
+    methods: tuple[Method, ...]
+    """The first one of ours is what ratios refer to."""
+    problems: Callable[[Settings], Iterable[Problem]]
+    """Made when the operation runs, one at a time."""
+    judge: Callable[[Any, Any], dict[str, float]]
+    """Data and result to figures; ``error`` among them."""
+    notes: tuple[str, ...] = field(default=())
+    """What a reader of the table must know."""
+
+
+def load(name: str) -> Any:
+    """A module of a peer, untyped: the type checker need not find it."""
+    return importlib.import_module(name)

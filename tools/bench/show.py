@@ -1,0 +1,134 @@
+"""Tables for people: on the terminal, as Markdown, and as plots."""
+
+from pathlib import Path
+
+from .plots import Dots, log_plot
+from .results import Report, Summary, Table, summarise, write_report
+
+FLOOR = 1e-9
+"""Errors below this are drawn here: a logarithmic axis has no zero."""
+
+
+def seconds(value: float | int) -> str:
+    """A duration with a unit.
+
+    >>> seconds(0.0123)
+    '12.3 ms'
+    """
+    for unit, scale in (("s", 1.0), ("ms", 1e3)):
+        if value * scale >= 1.0:
+            return f"{value * scale:.3g} {unit}"
+    return f"{value * 1e6:.3g} µs"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2g}"
+
+
+def _facts(facts: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in facts.items())
+
+
+def cells(summary: Summary) -> list[str]:
+    """One row of a table."""
+    return [
+        str(summary.size),
+        ("**" + summary.method + "**") if summary.ours else summary.method,
+        seconds(summary.wall),
+        seconds(summary.low),
+        seconds(summary.iqr),
+        seconds(summary.cpu),
+        "–" if summary.ratio is None else f"{summary.ratio:.2f}",
+        _number(summary.error),
+        _facts(summary.facts),
+    ]
+
+
+HEAD = ["size", "method", "median", "min", "IQR", "CPU", "× ours", "error", "also"]
+
+
+def print_report(report: Report) -> None:
+    """Print the tables of a report."""
+    from rich.console import Console
+    from rich.table import Table as RichTable
+
+    console = Console()
+    for table in report.tables:
+        grid = RichTable(title=table.title, caption=f"error: {table.error}")
+        for number, name in enumerate(HEAD):
+            grid.add_column(name, justify="left" if number in (1, 8) else "right", overflow="fold")
+        for summary in summarise(table):
+            row = cells(summary)
+            row[1] = f"[bold]{summary.method}[/bold]" if summary.ours else summary.method
+            grid.add_row(*row)
+        console.print(grid)
+        for absence in table.absent:
+            console.print(f"absent: {absence.method}: {absence.reason}", markup=False)
+        for note in table.notes:
+            console.print(f"note: {note}", markup=False)
+
+
+def markdown(report: Report) -> str:
+    """The tables of a report as Markdown."""
+    facts = report.environment
+    versions = facts["packages"] | facts["peers"]
+    shown = ", ".join(f"{name} {version}" for name, version in versions.items() if version)
+    out = [
+        f"*{facts['cpu']}, {facts['cores']} cores, {facts['threads']} threads; "
+        f"Python {facts['python']}; {shown}; commit {facts['git_commit'] or 'of the wheel'}.*",
+        "",
+    ]
+    for table in report.tables:
+        out += [f"### {table.title}", "", f"Error: {table.error}.", ""]
+        out += ["| " + " | ".join(HEAD) + " |", "|" + "---|" * len(HEAD)]
+        out += ["| " + " | ".join(cells(s)) + " |" for s in summarise(table)]
+        out.append("")
+        out += [f"- Absent: {a.method}: {a.reason}" for a in table.absent]
+        out += [f"- {note}" for note in table.notes]
+        out.append("")
+    return "\n".join(out).rstrip() + "\n"
+
+
+def pareto(table: Table) -> str:
+    """Run time against error, one dot per method, at the size with most methods."""
+    summaries = [s for s in summarise(table) if s.error is not None]
+    counts: dict[int, int] = {}
+    for summary in summaries:
+        counts[summary.size] = counts.get(summary.size, 0) + 1
+    size = max(counts, key=lambda s: (counts[s], s), default=0)
+    series = [
+        Dots(s.method, [s.wall], [max(s.error or 0.0, FLOOR)], bold=s.ours)
+        for s in summaries
+        if s.size == size
+    ]
+    return log_plot(series, f"{table.title} ({size})", "median seconds", table.error, front=True)
+
+
+def growth(table: Table) -> str:
+    """Run time against size, one line per method."""
+    lines: dict[str, list[Summary]] = {}
+    for summary in summarise(table):
+        lines.setdefault(summary.method, []).append(summary)
+    series = [
+        Dots(name, [float(s.size) for s in own], [s.wall for s in own], True, own[0].ours)
+        for name, own in lines.items()
+    ]
+    return log_plot(series, table.title, "size", "median seconds")
+
+
+def save_report(report: Report, out: Path) -> Path:
+    """Write the JSON, the Markdown and the plots of a report into a folder.
+
+    Returns:
+        The JSON file.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / f"{report.suite}.json"
+    write_report(report, path)
+    (out / f"{report.suite}.md").write_text(markdown(report), encoding="utf-8")
+    for table in report.tables:
+        name = f"{report.suite}_{table.operation}"
+        (out / f"{name}_pareto.svg").write_text(pareto(table), encoding="utf-8")
+        if len({row.size for row in table.rows}) > 1:
+            (out / f"{name}_growth.svg").write_text(growth(table), encoding="utf-8")
+    return path
