@@ -17,15 +17,20 @@ MAX_RADIUS = 10.0
 """Radius on the plane z = 1 (84 degrees off axis) up to which a lens without a fold is trusted."""
 
 
-def _padded(coefficients: Float[Tensor, "d"]) -> tuple[Tensor, ...]:
-    """The twelve coefficients as scalars, missing ones zero."""
+def _check_count(coefficients: Tensor) -> None:
     count = coefficients.shape[-1]
     if count not in COEFFICIENT_COUNTS:
         raise InputError(
             f"distortion: expected {COEFFICIENT_COUNTS} coefficients in OpenCV's order, found "
             f"{count}; pad with zeros or drop the tilt terms"
         )
-    return torch.cat([coefficients, coefficients.new_zeros(12 - count)]).unbind(-1)
+
+
+def _padded(coefficients: Float[Tensor, "d"]) -> tuple[Tensor, ...]:
+    """The twelve coefficients as scalars, missing ones zero."""
+    _check_count(coefficients)
+    missing = coefficients.new_zeros(12 - coefficients.shape[-1])
+    return torch.cat([coefficients, missing]).unbind(-1)
 
 
 def _radial(r2: Tensor, k: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
@@ -62,14 +67,12 @@ def distort(
     """
     if coefficients.shape[-1] == 0:
         return points
-    k = _padded(coefficients)
-    x, y = points.unbind(-1)
-    r2 = x * x + y * y
-    factor, _ = _radial(r2, k)
-    p1, p2, s1, s2, s3, s4 = k[2], k[3], k[8], k[9], k[10], k[11]
-    u = x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + s2 * r2)
-    v = y * factor + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + s4 * r2)
-    return torch.stack([u, v], -1)
+    from kornia.geometry.calibration import distort_points
+
+    _check_count(coefficients)
+    # kornia works on pixels: the plane z = 1 is the image of the identity intrinsics
+    flat, eye = points.reshape(1, -1, 2), torch.eye(3, dtype=points.dtype, device=points.device)
+    return distort_points(flat, eye[None], coefficients[None]).reshape(points.shape)
 
 
 def distortion_jacobian(

@@ -122,16 +122,9 @@ def quat_wxyz_to_rotmat(quat: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
     >>> quat_wxyz_to_rotmat(torch.tensor([2.0, 0.0, 0.0, 0.0])).diagonal().tolist()
     [1.0, 1.0, 1.0]
     """
-    square = quat.square().sum(-1)
-    scale = 2 / torch.where(square == 0, torch.ones_like(square), square)
-    w, x, y, z = quat.unbind(-1)
-    sw, sx, sy, sz = scale * w, scale * x, scale * y, scale * z
-    rows = (
-        *(1 - sy * y - sz * z, sx * y - sw * z, sx * z + sw * y),
-        *(sx * y + sw * z, 1 - sx * x - sz * z, sy * z - sw * x),
-        *(sx * z - sw * y, sy * z + sw * x, 1 - sx * x - sy * y),
-    )
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    from kornia.geometry.conversions import quaternion_to_rotation_matrix
+
+    return quaternion_to_rotation_matrix(quat)
 
 
 def rotmat_to_axis_angle(rotmat: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:

@@ -19,9 +19,10 @@ from .rigid import apply_linear, invert_linear
 from .surface import SurfaceIndex, closest_on_triangle
 
 MIN_DET = 1e-2  # a map with a smaller |determinant| has no inverse worth having
-STOP = 2e-6  # metres: iterations of a point end at this residual
+ARRIVED = 1e-3  # metres: a residual up to this counts as a root
+STOP = 5e-6  # metres: iterations of a point end at this residual
 LONGEST_STEP = 0.2  # metres: a Newton step of a nearly singular Jacobian is cut to this
-_VOXEL, _REACH, _LISTED = 0.015, 0.06, 24  # near-face lists of the rest surface: metres, metres, faces
+_VOXEL, _REACH, _LISTED = 0.015, 0.06, 48  # near-face lists of the rest surface: metres, metres, faces
 _GRID, _SPLAT = 72, 2.5  # first-guess grid of a pose: voxels per side, reach in voxels
 
 
@@ -222,6 +223,7 @@ def _build_lists(field: SkinningField) -> dict[str, Any]:
     launch(list_faces, len(cells), args, rest)
     return {
         "tris": tris,
+        "discs": _discs(tris),
         "faces": field.faces.int().contiguous(),
         "weights": field.weights.float().contiguous(),
         "lo": lo,
@@ -231,6 +233,16 @@ def _build_lists(field: SkinningField) -> dict[str, Any]:
         "face": face,
         "gap": gap,
     }
+
+
+def _discs(tris: Tensor) -> Tensor:
+    """Per face a disc that holds it, [F, 2, 4]: centre and radius, then the unit normal."""
+    centre = tris.mean(1)
+    radius = (tris - centre[:, None]).norm(dim=-1).amax(1) * (1 + 1e-4) + 1e-6
+    normal = torch.linalg.cross(tris[:, 1] - tris[:, 0], tris[:, 2] - tris[:, 0])
+    normal = torch.nn.functional.normalize(normal, dim=-1, eps=1e-30)
+    disc = torch.cat([centre, radius[:, None]], -1)
+    return torch.stack([disc, torch.nn.functional.pad(normal, (0, 1))], 1).contiguous()
 
 
 def vertex_inverses(
@@ -277,6 +289,8 @@ def newton_warp(
     iterations: int,
     max_distance: float,
     gradients: bool = True,
+    bones: tuple[Tensor, Tensor] | None = None,
+    starts: int = 1,
 ) -> tuple[Roots, Tensor]:
     """All iterations of every point in one kernel: Newton, or re-queries without ``gradients``.
 
@@ -302,11 +316,15 @@ def newton_warp(
     residual = torch.zeros(count, device=device)
     invertible = torch.zeros(count, dtype=torch.bool, device=device)
     args = [view(points, 3), view(guess, 3), _mesh_id(field.index), view(lists["tris"], 3)]
+    args += [view(lists["discs"], 4)]
     args += [view(lists["faces"], 3), lists["lo"], lists["dims"], lists["voxel"]]
     args += [view(lists["slots"]), view(lists["face"]), view(lists["gap"]), view(maps, 4)]
-    args += [view(lists["weights"]), iterations, int(gradients), STOP, MIN_DET]
+    none = (maps.new_zeros(0, 3), maps.new_zeros(0, 3, 4))
+    joints, inverses = none if bones is None else bones
+    args += [view(lists["weights"]), view(joints, 3), view(inverses, 4), starts]
+    args += [iterations, int(gradients), (STOP, ARRIVED, MIN_DET, min(max_distance, 1e10))]
     out = [view(rest, 3), view(weights), view(face), view(residual), view(invertible)]
-    launch(solve, count, [*args, min(max_distance, 1e10), *out], points)
+    launch(solve, count, [*args, *out], points)
     residual = torch.where(face >= 0, residual, math.inf)
     return Roots(rest, face.clamp(min=0).long(), residual, invertible), weights
 

@@ -170,11 +170,18 @@ def evaluate(run: Path, split: str | None, capture: Path | None, images: int | N
         images: images per split; the run folder is then left as it is. None for all.
     """
     avatar, stages = open_run(run, capture), Stages()
+    path = run / "training.json"
+    whole = images is None and split is None and path.is_file()
+    training = _training_facts(path) if whole else None
     names = held_out(avatar.record) if split is None else [split]
     with stages.timed("evaluation"):
         evaluations = evaluate_splits(avatar, names, images)
-    if images is None and split is None and (run / "training.json").is_file():
-        _rebuild(run, avatar, evaluations, stages)
+    if training is not None:
+        result, earlier = training
+        size = min(STRIP_SIZE, *avatar.record.image_size)
+        strip = [as_uint8(p.color) for p in turn(avatar, STRIP_VIEWS, size=size)]
+        report = write_results(run, avatar, result, evaluations, earlier | stages.seconds, strip)
+        print(f"report: {report}")
         return
     if images is None:
         write_scores(run, avatar.record, evaluations)
@@ -184,21 +191,15 @@ def evaluate(run: Path, split: str | None, capture: Path | None, images: int | N
         print(summary(evaluation))
 
 
-def _rebuild(run: Path, avatar: Avatar, evaluations: Sequence[Evaluation], stages: Stages) -> None:
-    """Write scores and report again, with what training.json says about the training."""
-    path = run / "training.json"
+def _training_facts(path: Path) -> tuple[TrainResult, dict[str, float]]:
+    """What a training.json says: what the training did, and seconds per stage."""
     facts = read_facts(path)
     names = [f.name for f in dataclasses.fields(TrainResult)]
     lacking = [n for n in (*names, "stages") if n not in facts]
     if lacking:
         raise InputError(f"{path}: expected {lacking[0]}, found no such entry; restore the file")
-    result = TrainResult(**{n: facts[n] for n in names})
-    result.stats = Counter(facts["stats"])
-    size = min(STRIP_SIZE, *avatar.record.image_size)
-    strip = [as_uint8(p.color) for p in turn(avatar, STRIP_VIEWS, size=size)]
-    seconds = facts["stages"] | stages.seconds
-    report = write_results(run, avatar, result, evaluations, seconds, strip)
-    print(f"report: {report}")
+    facts["stats"] = Counter(facts["stats"])
+    return TrainResult(**{n: facts[n] for n in names}), facts["stages"]
 
 
 def render(

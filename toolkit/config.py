@@ -192,7 +192,8 @@ def _checked(value: Any, hint: Any, where: str) -> Any:
     else:
         kinds = choices or (hint,)
         number = float in kinds and isinstance(value, int) and not isinstance(value, bool)
-        good = number or type(value) in kinds
+        value = float(value) if number else value
+        good = type(value) in kinds
     if not good:
         raise InputError(f"{where}: expected {hint}, found {value!r}; restore the file")
     return value

@@ -8,6 +8,10 @@ from .report_data import SkipRow
 
 PER_RAY = 64  # samples of a ray without skipping, as comparable methods take them
 PLAIN_WIDTH = 120  # characters of the table in a file or a pipe
+_KEPT = {
+    "training": "approximate: cells learned to be empty or hidden",
+    "rendering": "points that inverse skinning cannot bring back are outside the body",
+}
 VISIBLE = 0.5  # opacity from which on a pixel shows something
 
 
@@ -38,8 +42,8 @@ def skip_rows(stats: Mapping[str, int], what: str, num_parts: int) -> list[SkipR
                 "exact: density is 0 farther than the radius from every part",
             ),
         ]
+    evaluated = stats.get("samples_evaluated", shell)
     found, kept = stats.get("pairs_found"), stats.get("pairs_evaluated")
-    learned = "exact: nothing is left out" if found == kept else "approximate: learned empty cells"
     return [
         *rows,
         SkipRow(
@@ -49,12 +53,18 @@ def skip_rows(stats: Mapping[str, int], what: str, num_parts: int) -> list[SkipR
             "exact: voxels that no part reaches",
         ),
         SkipRow(
+            f"{what}: samples of the shell",
+            shell,
+            evaluated,
+            "within 5e-5 of full scale: the light of the ray is spent before",
+        ),
+        SkipRow(
             f"{what}: part evaluations",
-            None if shell is None else shell * num_parts,
+            None if evaluated is None else evaluated * num_parts,
             found,
             "exact: a sample belongs only to the parts within the radius",
         ),
-        SkipRow(f"{what}: part evaluations after learned occupancy", found, kept, learned),
+        SkipRow(f"{what}: part evaluations kept", found, kept, _KEPT.get(what, _KEPT["rendering"])),
         SkipRow(
             f"{what}: colour networks",
             kept,

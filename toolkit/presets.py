@@ -4,16 +4,12 @@ import dataclasses
 
 from monopart.geometry.errors import InputError
 
-from .config import Config, DeformConfig, FieldConfig, TrainConfig
+from .config import Config, DeformConfig, TrainConfig
 
 
 def _presets() -> dict[str, Config]:
     fast = Config(preset="fast")
-    tiny = Config(
-        preset="tiny",
-        field=FieldConfig(log2_size=14),
-        train=TrainConfig(iterations=600, rays=1024),
-    )
+    tiny = Config(preset="tiny", train=TrainConfig(seconds=100.0, checkpoint_seconds=30.0))
     rigid = Config(preset="rigid", deform=DeformConfig(residual=False))
     return {"fast": fast, "tiny": tiny, "rigid": rigid}
 

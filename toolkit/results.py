@@ -60,11 +60,9 @@ def write_results(
         rendering.update(evaluation.stats)
     rows = skipping(avatar, result.stats, result.iterations, rendering)
     peak = peak_memory_bytes()
-    facts = dataclasses.asdict(result) | {
-        "stages": dict(stages),
-        "peak_memory_bytes": peak,
-        "skipping": rows,
-    }
+    # Not dataclasses.asdict: it takes a Counter apart into counts of its pairs.
+    facts = {f.name: getattr(result, f.name) for f in dataclasses.fields(result)}
+    facts |= {"stages": dict(stages), "peak_memory_bytes": peak, "skipping": rows}
     write_json(run / "training.json", facts)
     write_scores(run, avatar.record, evaluations)
     absent = _warnings(avatar.record, evaluations)

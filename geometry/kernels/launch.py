@@ -50,7 +50,9 @@ def view(tensor: Tensor, vector: int = 1) -> Any:
     """
     init()
     dtype = _VECTOR[tensor.dtype, vector] if vector > 1 else _SCALAR[tensor.dtype]
-    argument = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    argument: Any = wp.from_torch(
+        tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True
+    )
     argument.tensor = tensor  # Warp's struct holds a bare pointer: a temporary would be freed
     return argument
 

@@ -17,44 +17,45 @@ _EMPTY = wp.constant(wp.int64(EMPTY))
 
 @no_type_check
 @wp.func
-def segment(p: wp.vec3, a: wp.vec3, b: wp.vec3):
-    """Parameter in [0, 1] of the point of a segment nearest to a point."""
-    e = b - a
-    square = wp.dot(e, e)
-    t = float(0.0)
-    if square > 0.0:
-        t = wp.clamp(wp.dot(p - a, e) / square, 0.0, 1.0)
-    return t
-
-
-@no_type_check
-@wp.func
 def bary_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Barycentrics of the nearest point of a triangle; exact zeros on edges and corners."""
+    """Barycentrics of the nearest point of a triangle; exact zeros on edges and corners.
+
+    C. Ericson, Real-Time Collision Detection, 2005, ch. 5.1.5: at most one division.
+    """
     ab = b - a
     ac = c - a
     ap = p - a
+    d1 = wp.dot(ab, ap)
+    d2 = wp.dot(ac, ap)
+    if d1 <= 0.0 and d2 <= 0.0:
+        return wp.vec3(1.0, 0.0, 0.0)
     d00 = wp.dot(ab, ab)
     d01 = wp.dot(ab, ac)
     d11 = wp.dot(ac, ac)
-    d20 = wp.dot(ap, ab)
-    d21 = wp.dot(ap, ac)
-    det = d00 * d11 - d01 * d01
-    v = d11 * d20 - d01 * d21
-    w = d00 * d21 - d01 * d20
-    if det > 5.0e-7 * d00 * d11 and v >= 0.0 and w >= 0.0 and v + w <= det:
-        return wp.vec3(1.0 - (v + w) / det, v / det, w / det)
-    s = segment(p, a, b)
-    t = segment(p, a, c)
-    u = segment(p, b, c)
-    gap_s = wp.length_sq(ap - ab * s)
-    gap_t = wp.length_sq(ap - ac * t)
-    gap_u = wp.length_sq(p - b - (c - b) * u)
-    if gap_s <= gap_t and gap_s <= gap_u:
-        return wp.vec3(1.0 - s, s, 0.0)
-    if gap_t <= gap_u:
+    d3 = d1 - d00
+    d4 = d2 - d01
+    if d3 >= 0.0 and d4 <= d3:
+        return wp.vec3(0.0, 1.0, 0.0)
+    d5 = d1 - d01
+    d6 = d2 - d11
+    if d6 >= 0.0 and d5 <= d6:
+        return wp.vec3(0.0, 0.0, 1.0)
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        t = d1 / wp.max(d00, 1.0e-30)
+        return wp.vec3(1.0 - t, t, 0.0)
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        t = d2 / wp.max(d11, 1.0e-30)
         return wp.vec3(1.0 - t, 0.0, t)
-    return wp.vec3(0.0, 1.0 - u, u)
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        t = (d4 - d3) / wp.max((d4 - d3) + (d5 - d6), 1.0e-30)
+        return wp.vec3(0.0, 1.0 - t, t)
+    scale = 1.0 / wp.max(va + vb + vc, 1.0e-30)
+    v = vb * scale
+    w = vc * scale
+    return wp.vec3(1.0 - v - w, v, w)
 
 
 @no_type_check
@@ -136,21 +137,43 @@ def list_faces(
 
 @no_type_check
 @wp.func
+def out_of_reach(p: wp.vec3, discs: wp.array2d(dtype=wp.vec4), f: int, best: float):
+    """Whether a face is certainly farther than ``best``: by the disc around it, in its plane."""
+    disc = discs[f, 0]
+    normal = discs[f, 1]
+    q = p - wp.vec3(disc[0], disc[1], disc[2])
+    h = wp.dot(q, wp.vec3(normal[0], normal[1], normal[2]))
+    rest = best * best - h * h
+    if rest < -1.0e-12:
+        return True
+    reach = disc[3] + wp.sqrt(wp.max(rest, 0.0))
+    return wp.dot(q, q) - h * h > reach * reach
+
+
+@no_type_check
+@wp.func
 def closest_face(
     p: wp.vec3,
     mesh: wp.uint64,
     tris: wp.array2d(dtype=wp.vec3),
+    discs: wp.array2d(dtype=wp.vec4),
     lo: wp.vec3,
     dims: wp.vec3i,
     voxel: float,
     slots: wp.array(dtype=wp.int32),
     near_face: wp.array2d(dtype=wp.int32),
     near_gap: wp.array2d(dtype=wp.float32),
+    hint: int,
     max_distance: float,
 ):
     """Closest face by the list of the voxel, exact by the triangle inequality; else by the tree."""
     best = int(-1)
     best_gap = max_distance
+    if hint >= 0:
+        d = gap_to_face(p, tris, hint)
+        if d < best_gap:
+            best_gap = d
+            best = hint
     proven = bool(False)
     cell = voxel_of(p, lo, dims, 1.0 / voxel)
     if cell >= 0:
@@ -163,12 +186,12 @@ def closest_face(
                 f = near_face[slot, k]
                 if f < 0 or near_gap[slot, k] - away > best_gap:
                     proven = True
-                else:
+                elif not out_of_reach(p, discs, f, best_gap):
                     d = gap_to_face(p, tris, f)
                     if d < best_gap:
                         best_gap = d
                         best = f
-                    k += 1
+                k += 1
     if not proven:
         query = wp.mesh_query_point_no_sign(mesh, p, best_gap)
         if query.result:
@@ -305,6 +328,23 @@ def blended_row(maps: wp.array2d(dtype=wp.vec4), row: int, v: wp.vec3i, w: wp.ve
 
 
 @no_type_check
+@wp.func
+def bone_guess(x: wp.vec3, rank: int, joints: wp.array(dtype=wp.vec3), bones: wp.array2d(dtype=wp.vec4)):
+    """The point under the inverse of the bone whose joint is the ``rank``-th nearest."""
+    floor = float(-1.0)
+    chosen = int(0)
+    for _ in range(rank + 1):
+        best = float(1.0e30)
+        for j in range(joints.shape[0]):
+            d = wp.length_sq(x - joints[j])
+            if d > floor and d < best:
+                best = d
+                chosen = j
+        floor = best
+    return affine(bones, chosen, wp.vec4(x[0], x[1], x[2], 1.0))
+
+
+@no_type_check
 @wp.kernel
 def solve(
     start: int,
@@ -312,6 +352,7 @@ def solve(
     guess: wp.array(dtype=wp.vec3),
     mesh: wp.uint64,
     tris: wp.array2d(dtype=wp.vec3),
+    discs: wp.array2d(dtype=wp.vec4),
     faces: wp.array(dtype=wp.vec3i),
     lo: wp.vec3,
     dims: wp.vec3i,
@@ -321,18 +362,23 @@ def solve(
     near_gap: wp.array2d(dtype=wp.float32),
     maps: wp.array2d(dtype=wp.vec4),
     weights: wp.array2d(dtype=wp.float32),
+    joints: wp.array(dtype=wp.vec3),
+    bones: wp.array2d(dtype=wp.vec4),
+    starts: int,
     iterations: int,
     gradients: int,
-    stop: float,
-    min_det: float,
-    max_distance: float,
+    limits: wp.vec4,
     rest: wp.array(dtype=wp.vec3),
     blend: wp.array2d(dtype=wp.float32),
     face: wp.array(dtype=wp.int32),
     residual: wp.array(dtype=wp.float32),
     invertible: wp.array(dtype=wp.bool),
 ):
-    """Solve x = A(w(p)) p from a guess: Newton steps, or re-queries where ``gradients`` is 0."""
+    """Solve x = A(w(p)) p from a guess: Newton steps, or re-queries where ``gradients`` is 0.
+
+    A point that did not arrive starts again from the inverse of its nearest bones. ``limits`` are: residual
+    that ends the iterations, residual that ends the starts, smallest determinant, reach of the rest surface.
+    """
     i = start + wp.tid()
     x = points[i]
     p = guess[i]
@@ -341,13 +387,16 @@ def solve(
     best_face = int(-1)
     best = float(1.0e30)
     best_ok = bool(False)
+    f = int(-1)
     k = int(0)
-    while k <= iterations:
-        f = closest_face(p, mesh, tris, lo, dims, voxel, slots, near_face, near_gap, max_distance)
+    attempt = int(0)
+    while attempt < starts:
+        f = closest_face(
+            p, mesh, tris, discs, lo, dims, voxel, slots, near_face, near_gap, f, limits[3]
+        )
+        over = k >= iterations or f < 0
         k += 1
-        if f < 0:
-            k = iterations + 1
-        else:
+        if f >= 0:
             a = tris[f, 0]
             b = tris[f, 1]
             c = tris[f, 2]
@@ -363,33 +412,38 @@ def solve(
             r1 = blended_row(maps, 1, v, w)
             r2 = blended_row(maps, 2, v, w)
             step, det = solve_rows(r0, r1, r2, e)
-            ok = wp.abs(det) > min_det
+            ok = wp.abs(det) > limits[2]
             if r < best:
                 best = r
                 best_p = p
                 best_w = w
                 best_face = f
                 best_ok = ok
-            if r <= stop:
-                k = iterations + 1
-            else:
-                if gradients != 0:
-                    gb, gc = bary_gradients(w, a, b, c)
-                    db = yb - ya
-                    dc = yc - ya
-                    r0 += gb * db[0] + gc * dc[0]
-                    r1 += gb * db[1] + gc * dc[1]
-                    r2 += gb * db[2] + gc * dc[2]
-                    full, full_det = solve_rows(r0, r1, r2, e)
-                    if wp.abs(full_det) > min_det:
-                        step = full
-                        ok = True
-                size = wp.length(step)
-                if not ok or not (size < 1.0e6):
-                    k = iterations + 1
-                elif size > 0.2:
-                    step = step * (0.2 / size)
-                p = p + step
+            over = over or r <= limits[0]
+            if gradients != 0 and not over:
+                gb, gc = bary_gradients(w, a, b, c)
+                db = yb - ya
+                dc = yc - ya
+                r0 += gb * db[0] + gc * dc[0]
+                r1 += gb * db[1] + gc * dc[1]
+                r2 += gb * db[2] + gc * dc[2]
+                full, full_det = solve_rows(r0, r1, r2, e)
+                if wp.abs(full_det) > limits[2]:
+                    step = full
+                    ok = True
+            size = wp.length(step)
+            over = over or not ok
+            if size > 0.2:
+                step = step * (0.2 / size)
+            p = p + step
+        if over:
+            attempt += 1
+            if best <= limits[1]:
+                attempt = starts
+            if attempt < starts:
+                p = bone_guess(x, attempt - 1, joints, bones)
+                f = -1
+                k = 0
     rest[i] = best_p
     face[i] = best_face
     residual[i] = best

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from monopart.geometry.body import BodyModel, BodyPose
+from monopart.geometry.body import BodyModel, BodyPose, PosedBody
 from monopart.geometry.cameras import Rays
 from monopart.geometry.consistency import consistency_loss, round_trip
 from monopart.geometry.culling import ShellSamples
@@ -23,14 +23,12 @@ CANONICAL = BODY.canonical(torch.zeros(BODY.num_betas))
 Batch = tuple[PosedParts, ShellSamples, PartPairs, RestPoints]
 
 
-def poses(count: int) -> BodyPose:
+def poses() -> BodyPose:
     generator = torch.Generator().manual_seed(5)
     pose = BodyPose.zeros(BODY, (3,))
     pose.pose[1:] = 0.3 * torch.randn(2, 24, 3, generator=generator)
     pose.betas[:] = 0.5 * torch.randn(3, BODY.num_betas, generator=generator)
-    return BodyPose(
-        pose.pose[:count], pose.betas[:count], pose.rotation[:count], pose.translation[:count]
-    )
+    return pose
 
 
 def ask(parts: PosedParts, count: int = 1500, step: float = 0.02) -> Batch:
@@ -47,7 +45,7 @@ def ask(parts: PosedParts, count: int = 1500, step: float = 0.02) -> Batch:
 
 @pytest.fixture(scope="module")
 def batch() -> Batch:
-    return ask(PosedParts(BODY, BODY(poses(3)), CANONICAL, PARTS, RADIUS))
+    return ask(PosedParts(BODY, BODY(poses()), CANONICAL, PARTS, RADIUS))
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +99,7 @@ def test_unskin_is_the_torch_path(batch: Batch) -> None:
     parts, samples, pairs, rest = batch
     corner_weights = BODY.weights.double()[BODY.faces[pairs.face]]
     weights = (full_bary(pairs).double()[..., None] * corner_weights).sum(1)
-    transforms = BODY(poses(3)).transforms.double()
+    transforms = BODY(poses()).transforms.double()
     owner = samples.body[pairs.sample].long()
     valid = torch.zeros(len(owner), dtype=torch.bool)
     expected = torch.zeros(len(owner), 3, dtype=torch.float64)
@@ -123,14 +121,17 @@ def test_unskin_is_the_torch_path(batch: Batch) -> None:
 
 def test_a_body_alone_is_asked_like_one_of_many(batch: Batch) -> None:
     _, samples, pairs, rest = batch
-    given = poses(3)
+    posed = BODY(poses())
+    fields = [getattr(posed, field.name) for field in dataclasses.fields(PosedBody)]
     for b in range(3):
-        fields = (given.pose, given.betas, given.rotation, given.translation)
-        alone = PosedParts(BODY, BODY(BodyPose(*(f[b] for f in fields))), CANONICAL, PARTS, RADIUS)
+        single = PosedBody(*(field[b] for field in fields))
+        alone = PosedParts(BODY, single, CANONICAL, PARTS, RADIUS)
         rows = (samples.body == b).nonzero().squeeze(-1)
         mine = dataclasses.replace(
             samples,
             points=samples.points[rows],
+            depth=samples.depth[rows],
+            ray=samples.ray[rows],
             body=torch.zeros(len(rows), dtype=torch.int32),
             candidates=samples.candidates[rows],
         )

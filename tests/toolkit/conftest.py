@@ -24,5 +24,13 @@ def trained_run(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -
     """A run of three iterations on `small_capture`, made by the program; not to be changed."""
     run = tmp_path_factory.mktemp("runs") / "run"
     command = ["train", str(small_capture), "--out", str(run), "--preset", "tiny"]
-    assert cli.main([*command, "--iterations", "3", "--explain", "--set", *TINY]) is None
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("monopart.toolkit.commands.STRIP_VIEWS", 2)
+        assert cli.main([*command, "--iterations", "3", "--explain", "--set", *TINY]) is None
     return run
+
+
+@pytest.fixture
+def short_strip(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Turntables of reports have two pictures."""
+    monkeypatch.setattr("monopart.toolkit.commands.STRIP_VIEWS", 2)

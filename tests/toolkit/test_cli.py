@@ -18,6 +18,7 @@ from monopart.toolkit import arguments, cli, commands, video
 from monopart.toolkit.config import from_json
 from monopart.toolkit.train import Trainer
 
+pytestmark = pytest.mark.usefixtures("short_strip")
 SNAPSHOT = Path(__file__).parents[1] / "snapshots" / "cli_help.txt"
 COMMANDS = ("train", "eval", "render", "turntable", "info", "demo")
 FILES = {
@@ -56,6 +57,7 @@ def test_run_folder_is_complete(trained_run):
         assert {"iteration", "seconds", "losses", "psnr"} <= row.keys()
     facts = json.loads((trained_run / "training.json").read_text())
     assert facts["iterations"] == 3 and facts["seconds"] > 0 and facts["stages"]["training"] > 0
+    assert facts["stats"]["rays"] >= 3 * 128
     assert {"what", "dense", "kept", "note"} == facts["skipping"][0].keys()
     page = (trained_run / "report.html").read_text(encoding="utf-8")
     assert "worst of split" in page and "rendering: rays" in page and "<title>small: run" in page

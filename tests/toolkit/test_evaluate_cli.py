@@ -17,6 +17,9 @@ from monopart.toolkit.report_content import capture_facts
 from monopart.toolkit.runs import open_run
 
 
+pytestmark = pytest.mark.usefixtures("short_strip")
+
+
 @pytest.fixture
 def run(trained_run, tmp_path):
     """A copy that may be changed."""

@@ -17,6 +17,7 @@ COUNTS = {
     "rays": 10,
     "samples_dense": 400,
     "samples_shell": 100,
+    "samples_evaluated": 80,
     "pairs_found": 120,
     "pairs_evaluated": 90,
     "colors_evaluated": 70,
@@ -30,12 +31,17 @@ def avatar(trained_run):
 
 def test_rows_of_training_and_rendering():
     training = skip_rows(COUNTS, "training", 5)
-    assert [(r.dense, r.kept) for r in training] == [(400, 100), (500, 120), (120, 90), (90, 70)]
-    assert "approximate" in training[2].note
-    exact = {**COUNTS, "pairs_evaluated": 120, "pixels": 50}
-    rendering = skip_rows(exact, "rendering", 5)
+    assert [(r.dense, r.kept) for r in training] == [
+        (400, 100),
+        (100, 80),
+        (400, 120),
+        (120, 90),
+        (90, 70),
+    ]
+    assert all(r.what.startswith("training: ") and r.note for r in training)
+    rendering = skip_rows({**COUNTS, "pixels": 50}, "rendering", 5)
     assert [(r.dense, r.kept) for r in rendering[:2]] == [(50, 10), (3200, 100)]
-    assert all(r.note.startswith("exact") and r.what.startswith("rendering") for r in rendering)
+    assert "approximate" in training[3].note and "approximate" not in rendering[5].note
 
 
 def test_counts_that_are_missing_are_said(capsys):
@@ -95,6 +101,7 @@ def test_a_camera_that_looks_away(avatar, angle, words):
 def test_a_field_without_density(avatar):
     view = view_of(avatar.record, 0, 0)
     picture = render_view(avatar, view)
+    assert picture.stats.keys() == {"pixels", *STATS} and all(picture.stats.values())
     empty = dataclasses.replace(picture, opacity=0.01 * torch.ones_like(picture.opacity))
     why = why_empty(avatar, view, empty)
     assert why is not None and "largest opacity 0.010" in why and "train longer" in why

@@ -25,7 +25,7 @@ from monopart.toolkit.train import TrainResult
 
 
 def _image(frame: int, psnr: float) -> ImageScore:
-    scores = {"psnr": psnr, "ssim": 0.9, "lpips": None}
+    scores = {"psnr": float(psnr), "ssim": 0.9, "lpips": None}
     picture = torch.zeros(48, 48, 3, dtype=torch.uint8)
     picture[12:40, 15:30] = 90
     return ImageScore(1, frame, {"full": scores, "box": scores}, 0.25, picture)
@@ -70,7 +70,7 @@ def test_curves(tmp_path):
     path.write_text('{"iteration": 1}\n{"iteration": 2}\n')
     assert read_curves(path) == [{"iteration": 1}, {"iteration": 2}]
     path.write_text('{"iteration": 1}\n{"iter')
-    with pytest.raises(InputError, match="train.jsonl, line 2: expected JSON"):
+    with pytest.raises(InputError, match=r"train\.jsonl, line 2: expected JSON"):
         read_curves(path)
 
 

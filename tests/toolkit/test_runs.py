@@ -94,7 +94,9 @@ def test_weights_of_another_configuration(run):
     facts = json.loads(path.read_text())
     facts["field"]["log2_size"] += 1
     path.write_text(json.dumps(facts))
-    with pytest.raises(InputError, match="model.safetensors: expected the tensors of this config"):
+    with pytest.raises(
+        InputError, match=r"model\.safetensors: expected the tensors of this config"
+    ):
         open_run(run)
 
 

@@ -1,1 +1,1 @@
-"""Benchmarks: run time against error of every operation, ours and other libraries', in one process."""
+"""Benchmarks: run time against error, our operations and other libraries' in one process."""

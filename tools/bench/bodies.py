@@ -28,7 +28,7 @@ _LIMITS = {
     "elbow": (0.3, 2.2, 0.3),
     "wrist": (0.5, 0.4, 0.9),
 }
-"""Largest rotation about x, y and z of joints by a part of their name, radians; no more than a guess."""
+"""Largest rotation about x, y and z of joints by a part of their name, radians; a guess."""
 
 
 def joint_limits(body: BodyModel) -> Float[Tensor, "J 3"]:
@@ -176,9 +176,7 @@ def surface_data(
     body: BodyModel, pose: BodyPose, count: int, seed: int = 0, shift: float = 0.05
 ) -> SurfaceData:
     """A posed body with points near its surface, and another pose near by."""
-    moved = BodyPose(
-        pose.pose + shift * math.pi / 10, pose.betas, pose.rotation, pose.translation
-    )
+    moved = BodyPose(pose.pose + shift * math.pi / 10, pose.betas, pose.rotation, pose.translation)
     with torch.no_grad():
         posed, other = body(pose), body(moved).verts
         rest = body.shaped(pose.betas)[0]

@@ -27,7 +27,7 @@ class Change:
 
 def changes(a: Report, b: Report) -> list[Change]:
     """Rows that both reports have, largest change first."""
-    before = {key: row for key, row in _rows(a)}
+    before = dict(_rows(a))
     result = []
     for key, row in _rows(b):
         old = before.get(key)

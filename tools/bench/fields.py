@@ -1,4 +1,4 @@
-"""``monopart-bench fields``: hash grid, networks and compositing against plain and compiled torch."""
+"""``monopart-bench fields``: hash grid, networks, compositing against eager and compiled torch."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from monopart.fields.hash_grid import GridSpec, HashGrid
 from monopart.fields.mlp import PartMLP
-from monopart.fields.volume import composite
+from monopart.fields.volume import composite, composite_dense
 
 from .registry import Method, Operation, Problem, Settings
 from .skinning_methods import no_compiler
@@ -68,7 +68,26 @@ class _Volume:
     ray_start: Tensor
 
     def __call__(self, backend: Any, sigma: Tensor, color: Tensor, delta: Tensor) -> Tensor:
+        if backend == "dense":
+            return self._dense(sigma, color, delta)
         return composite(sigma, color, delta, self.ray_start, backend=backend).color
+
+    @cached_property
+    def _layout(self) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
+        """Row and column of every sample in a padded table, and its shape; not timed."""
+        counts = self.ray_start.diff()
+        ray = torch.repeat_interleave(torch.arange(len(counts)), counts)
+        column = torch.arange(len(ray)) - self.ray_start[ray]
+        return (ray, column), (len(counts), int(counts.max()))
+
+    def _dense(self, sigma: Tensor, color: Tensor, delta: Tensor) -> Tensor:
+        """Padded, without a check that would break a compiled graph."""
+        index, shape = self._layout
+
+        def pad(values: Tensor) -> Tensor:
+            return values.new_zeros(*shape, *values.shape[1:]).index_put(index, values)
+
+        return composite_dense(pad(sigma), pad(color), pad(delta)).color
 
     def double_outcome(self, case: Case) -> Outcome:
         """Padded, in double precision."""
@@ -148,12 +167,12 @@ def _run(backend: str, compiled: bool = False) -> Callable[[Any], Callable[[], O
     return prepare
 
 
-def kernel_methods() -> tuple[Method, ...]:
-    """Back ends of one function."""
+def kernel_methods(compiled: str = "torch") -> tuple[Method, ...]:
+    """Back ends of one function; ``compiled`` is the one that torch.compile gets."""
     return (
         Method("monopart (Warp)", _run("warp"), ours=True),
         Method("torch, eager", _run("torch")),
-        Method("torch.compile", _run("torch", True), needs=no_compiler),
+        Method("torch.compile", _run(compiled, True), needs=no_compiler, slow_start=True),
     )
 
 
@@ -221,7 +240,7 @@ def operations() -> tuple[Operation, ...]:
     """All operations of the fields suite."""
     kinds = (
         ("grid", "Hash grid, 16 levels × 2", _grids, kernel_methods()),
-        ("composite", "Compositing", _volumes, kernel_methods()),
+        ("composite", "Compositing", _volumes, kernel_methods("dense")),
         ("mlp", "One network 32-64-64-16 per part", _networks, network_methods()),
     )
     result = []

@@ -1,4 +1,4 @@
-"""Scatter plots with two logarithmic axes as stand-alone SVG files, light or dark as the viewer is."""
+"""Scatter plots with two logarithmic axes as SVG files, light or dark as the viewer is."""
 
 import html
 import math
@@ -118,7 +118,8 @@ def _grid(x: _Log, y: _Log) -> str:
         left = x.at(tick)
         out.append(
             f'<line class="grid" x1="{left:.1f}" x2="{left:.1f}" y1="{y.end}" y2="{y.start}"/>'
-            f'<text x="{left:.1f}" y="{y.start + 18}" text-anchor="middle">{tick_label(tick)}</text>'
+            f'<text x="{left:.1f}" y="{y.start + 18}" text-anchor="middle">'
+            f"{tick_label(tick)}</text>"
         )
     for tick in y.shown():
         top = y.at(tick)

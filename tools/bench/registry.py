@@ -49,7 +49,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Method:
-    """One way to carry out an operation; a peer says how it is installed and whether it is there."""
+    """One way to carry out an operation; a peer says whether it is there and how to install it."""
 
     name: str
     """Shown in tables."""
@@ -67,9 +67,13 @@ class Method:
     """Brings an untimed result into the form that the judge expects."""
     needs: Callable[[], str | None] | None = None
     """Another reason for absence, or None."""
+    slow_start: bool = False
+    """Takes seconds to prepare: left out of quick runs."""
 
-    def absent(self) -> str | None:
-        """Why the method cannot run here, with the install line; None where it can."""
+    def absent(self, quick: bool = False) -> str | None:
+        """Why the method does not run here, with the install line; None where it does."""
+        if quick and self.slow_start:
+            return "left out by --quick"
         for name in self.modules:
             if importlib.util.find_spec(name) is None:
                 return f"not installed; {self.install}"

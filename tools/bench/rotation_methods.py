@@ -176,7 +176,7 @@ def _opencv_lens(steps: int) -> Callable[[Any], Callable[[], Tensor]]:
         stop = (cv2.TERM_CRITERIA_COUNT, steps, 0.0)
 
         def call() -> Tensor:
-            found = cv2.undistortPoints(pixels, K, lens, None, None, None, None, stop)
+            found = cv2.undistortPoints(pixels, K, lens, R=None, P=None, criteria=stop)
             return torch.from_numpy(np.asarray(found)[:, 0])
 
         return call

@@ -53,10 +53,12 @@ def print_report(report: Report) -> None:
     from rich.table import Table as RichTable
 
     console = Console()
+    console = Console(width=max(console.width, 128))
     for table in report.tables:
         grid = RichTable(title=table.title, caption=f"error: {table.error}")
-        for number, name in enumerate(HEAD):
-            grid.add_column(name, justify="left" if number in (1, 8) else "right", overflow="fold")
+        for name in HEAD:
+            left = name in ("method", "also")
+            grid.add_column(name, justify="left" if left else "right", no_wrap=name != "also")
         for summary in summarise(table):
             row = cells(summary)
             row[1] = f"[bold]{summary.method}[/bold]" if summary.ours else summary.method

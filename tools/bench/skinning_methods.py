@@ -31,7 +31,10 @@ class SkinningData:
         """Vertices in double precision, by the plain function."""
         arrays = [a.double() for a in plain_arrays(self.body)]
         return plain_skinning(
-            self.pose.detach().double(), self.betas.detach().double(), arrays, self.body.tree.parents
+            self.pose.detach().double(),
+            self.betas.detach().double(),
+            arrays,
+            self.body.tree.parents,
         )
 
     @cached_property
@@ -147,13 +150,17 @@ def _body_models(data: SkinningData) -> Run:
     smpl = load("body_models.smpl.torch").SMPL
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "body.npz"
-        template, shapedirs, posedirs, regressor, weights = (
-            a.numpy() for a in plain_arrays(body)
+        template, shapedirs, posedirs, regressor, weights = (a.numpy() for a in plain_arrays(body))
+        np.savez(
+            path,
+            v_template=template,
+            shapedirs=shapedirs,
+            posedirs=posedirs,
+            J_regressor=regressor,
+            weights=weights,
+            kintree_table=np.array([body.tree.parents, range(body.num_joints)]),
+            f=body.faces.numpy(),
         )
-        tree = np.array([body.tree.parents, range(body.num_joints)])
-        arrays = {"v_template": template, "shapedirs": shapedirs, "posedirs": posedirs}
-        arrays |= {"J_regressor": regressor, "weights": weights, "kintree_table": tree}
-        np.savez(path, f=body.faces.numpy(), **arrays)
         model = smpl(model_path=path)
 
     def run(pose: Tensor, betas: Tensor) -> Tensor:
@@ -174,7 +181,9 @@ def skinning_methods() -> tuple[Method, ...]:
     return (
         Method("monopart", _method(_ours), ours=True),
         Method("plain torch", _method(_plain)),
-        Method("torch.compile of plain torch", _method(_compiled), needs=no_compiler),
+        Method(
+            "torch.compile of plain torch", _method(_compiled), needs=no_compiler, slow_start=True
+        ),
         Method("smplx", _method(_smplx), ("smplx",), "pip install --no-deps smplx"),
         Method(
             "body-models", _method(_body_models), ("body_models",), "pip install body-models[torch]"

@@ -60,7 +60,7 @@ def run_operation(operation: Operation, settings: Settings) -> Table:
     absent: dict[str, str] = {}
     present: list[Method] = []
     for method in operation.methods:
-        reason = method.absent()
+        reason = method.absent(settings.quick)
         if reason is None:
             present.append(method)
         else:

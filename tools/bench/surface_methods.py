@@ -4,8 +4,9 @@ An adapter gets a `SurfaceData`, builds its structure, and offers ``query`` (fac
 barycentrics) and, where the library can, ``update`` (other vertices).
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -18,15 +19,18 @@ Found = tuple[np.ndarray, np.ndarray]
 """Faces [N] and barycentrics [N, 3]."""
 
 
-class Peer(Protocol):
+class Peer(ABC):
     """A search structure of some library."""
 
+    @abstractmethod
     def __init__(self, data: SurfaceData) -> None:
         """Build it."""
 
+    @abstractmethod
     def update(self, verts: Any) -> None:
         """Move the vertices."""
 
+    @abstractmethod
     def query(self) -> Any:
         """Search all points."""
 
@@ -35,7 +39,7 @@ def _single(data: SurfaceData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return data.points.numpy(), data.verts.numpy(), data.faces.numpy()
 
 
-class Ours:
+class Ours(Peer):
     """`monopart.geometry.surface.SurfaceIndex`."""
 
     backend = "auto"
@@ -61,7 +65,7 @@ class OursPlain(Ours):
     backend = "torch"
 
 
-class WarpPlain:
+class WarpPlain(Peer):
     """Warp's own mesh query on one thread."""
 
     def __init__(self, data: SurfaceData) -> None:
@@ -81,7 +85,7 @@ class WarpPlain:
         return face, np.concatenate([two, 1.0 - two.sum(1, keepdims=True)], 1)
 
 
-class Open3D:
+class Open3D(Peer):
     """Open3D's ray-casting scene (Embree)."""
 
     def __init__(self, data: SurfaceData) -> None:
@@ -108,7 +112,7 @@ class Open3D:
         return found["primitive_ids"].numpy(), bary
 
 
-class Libigl:
+class Libigl(Peer):
     """libigl's tree in double precision."""
 
     def __init__(self, data: SurfaceData) -> None:
@@ -133,19 +137,22 @@ class Libigl:
         return face, barycentrics(on, self.verts[self.faces[face]])
 
 
-class Trimesh:
+class Trimesh(Peer):
     """trimesh's proximity query over an R-tree."""
 
     def __init__(self, data: SurfaceData) -> None:
         """Build the tree."""
         self.trimesh = load("trimesh")
-        self.points, verts, faces = data.arrays
-        self.mesh = self.trimesh.Trimesh(verts, faces, process=False)
+        self.points, verts, self.faces = data.arrays
+        self._build(verts)
+
+    def _build(self, verts: np.ndarray) -> None:
+        self.mesh = self.trimesh.Trimesh(verts, self.faces, process=False)
         _ = self.mesh.triangles_tree
 
     def update(self, verts: Any) -> None:
-        """Give the mesh other vertices, which drops its tree."""
-        self.mesh.vertices = verts.numpy()
+        """Build anew: a mesh drops its tree when its vertices move."""
+        self._build(verts.double().numpy())
 
     def query(self) -> Found:
         """Faces and barycentrics."""
@@ -153,7 +160,7 @@ class Trimesh:
         return face, self.trimesh.triangles.points_to_barycentric(self.mesh.triangles[face], on)
 
 
-class Fcpw:
+class Fcpw(Peer):
     """FCPW with a vectorised tree; the result stays in its own list."""
 
     def __init__(self, data: SurfaceData) -> None:
@@ -207,13 +214,13 @@ def _query(adapter: type[Peer]) -> Callable[[Any], Callable[[], Any]]:
 
 
 def _moving(adapter: type[Peer]) -> Callable[[Any], Callable[[], Any]]:
-    """Other vertices, then the vertices of the problem, and a query: two updates and one query."""
+    """Other vertices and a query, the structure built for those of another pose."""
 
     def prepare(data: SurfaceData) -> Callable[[], Any]:
         peer = adapter(data)
+        peer.update(data.other)
 
         def call() -> Any:
-            peer.update(data.other)
             peer.update(data.verts)
             return peer.query()
 
@@ -233,7 +240,12 @@ def surface_methods(moving: bool = False) -> tuple[Method, ...]:
         Method("Open3D", wrap(Open3D), ("open3d",), "pip install open3d"),
         Method("libigl (float64)", wrap(Libigl), ("igl",), "pip install libigl"),
         Method(
-            "trimesh", wrap(Trimesh), ("trimesh", "rtree"), "pip install trimesh rtree", False, small
+            "trimesh",
+            wrap(Trimesh),
+            ("trimesh", "rtree"),
+            "pip install trimesh rtree",
+            False,
+            small,
         ),
         Method(
             *("fcpw", wrap(Fcpw), ("fcpw",), "pip install fcpw"),
@@ -312,5 +324,3 @@ def judge_nearest(data: SurfaceData, found: Any) -> dict[str, float]:
         "error": float(np.abs(gap).mean()),
         "weights p99": float(np.quantile(variation, 0.99)),
     }
-
-

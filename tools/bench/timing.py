@@ -1,4 +1,4 @@
-"""Interleaved timing: warm-up, rounds over all methods, medians with spread, wall and CPU seconds."""
+"""Interleaved timing: warm-up, rounds over all methods, medians with spread, wall and CPU time."""
 
 import gc
 import time

@@ -1,0 +1,90 @@
+"""``monopart-bench render RUN``: seconds per picture of a trained run, and what was evaluated."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from monopart.geometry.errors import InputError
+
+from .registry import Method, Operation, Problem, Settings
+
+PRUNE = 2e-3
+VIEWS = 3
+
+
+@dataclass(eq=False)
+class ViewData:
+    """One view of a trained avatar."""
+
+    avatar: Any
+    view: Any
+
+    @cached_property
+    def dense(self) -> Any:
+        """The picture with no ray left out."""
+        from monopart.toolkit.render import render_view
+
+        return render_view(self.avatar, self.view, skip=False)
+
+
+def _picture(**options: Any) -> Callable[[Any], Callable[[], Any]]:
+    def prepare(data: ViewData) -> Callable[[], Any]:
+        from monopart.toolkit.render import render_view
+
+        return lambda: render_view(data.avatar, data.view, **options)
+
+    return prepare
+
+
+def _problems(settings: Settings) -> Iterator[Problem]:
+    import dataclasses
+
+    from monopart.toolkit.avatar import view_of
+    from monopart.toolkit.runs import open_run
+
+    if settings.run is None:
+        raise InputError(
+            "render: expected a run folder, found none; name one made by monopart train"
+        )
+    avatar = open_run(settings.run, settings.capture)
+    record = avatar.record
+    name = "novel_view" if "novel_view" in record.splits else "train"
+    pairs = record.split(name).pairs()
+    count = 1 if settings.quick else min(VIEWS, len(pairs))
+    for camera, frame in (pairs[i * len(pairs) // count] for i in range(count)):
+        view = view_of(record, camera, frame)
+        if settings.quick:
+            view = dataclasses.replace(view, camera=view.camera.resized((24, 24)))
+        height, width = view.camera.size
+        label = f"camera {record.camera_names[camera]} frame {frame}"
+        yield Problem(height * width, label, ViewData(avatar, view))
+
+
+def _judge(data: ViewData, picture: Any) -> dict[str, float]:
+    stats = picture.stats
+    dense = 64.0 * stats["pixels"]
+    return {
+        "error": float((picture.color - data.dense.color).abs().max()),
+        "rays %": 100.0 * stats["rays"] / stats["pixels"],
+        "samples % of 64 a pixel": 100.0 * stats["samples_shell"] / dense,
+        "pairs evaluated %": 100.0 * stats["pairs_evaluated"] / dense,
+        "colours %": 100.0 * stats["colors_evaluated"] / dense,
+    }
+
+
+def operations() -> tuple[Operation, ...]:
+    """The one operation of the suite."""
+    methods = (
+        Method("exact skipping", _picture(), ours=True),
+        Method(f"learned occupancy, {PRUNE}", _picture(prune=PRUNE), ours=True),
+        Method("every ray of the image", _picture(skip=False), ours=True),
+    )
+    return (
+        Operation(
+            *("picture", "Rendering one picture, posing the body included"),
+            "largest difference in colour from the picture with every ray",
+            *(methods, _problems, _judge),
+            ("Shares refer to 64 samples for every pixel of the image.",),
+        ),
+    )
