@@ -32,7 +32,7 @@ class PartOccupancy(torch.nn.Module):
         self,
         lo: Float[Tensor, "k 3"],
         edge: Float[Tensor, "k"],
-        cells: int = 96,
+        cells: int = 64,
         decay: float = 0.9,
     ) -> None:
         """Make the cells.

@@ -15,14 +15,13 @@ from torch import Tensor
 
 from .body import BodyModel
 from .errors import InputError
-from .rigid import apply_linear, invert_linear
+from .rigid import apply_linear, invert_affine, invert_linear
 from .surface import SurfaceIndex, closest_on_triangle
 
 MIN_DET = 1e-2  # a map with a smaller |determinant| has no inverse worth having
 ARRIVED = 1e-3  # metres: a residual up to this counts as a root
-STOP = 5e-6  # metres: iterations of a point end at this residual
 LONGEST_STEP = 0.2  # metres: a Newton step of a nearly singular Jacobian is cut to this
-_VOXEL, _REACH, _LISTED = 0.015, 0.06, 48  # near-face lists of the rest surface: metres, metres, faces
+_VOXEL, _REACH, _LISTED = 0.0125, 0.06, 48  # near-face lists of the rest surface: metres, metres, faces
 _GRID, _SPLAT = 72, 2.5  # first-guess grid of a pose: voxels per side, reach in voxels
 
 
@@ -60,6 +59,51 @@ class Roots:
     face: Int[Tensor, "n"]
     residual: Float[Tensor, "n"]
     invertible: Bool[Tensor, "n"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to search.
+
+    Attributes:
+        iterations: steps of one start.
+        starts: first guesses at most; the next one is for points that did not arrive.
+        max_distance: reach of the rest surface, metres.
+        stop: residual that ends the iterations of a point, metres.
+        gradients: Newton's Jacobian; False only re-queries the weights.
+    """
+
+    iterations: int
+    starts: int
+    max_distance: float
+    stop: float
+    gradients: bool
+
+
+@dataclass(frozen=True)
+class Bones:
+    """Rigid inverses as first guesses.
+
+    Attributes:
+        joints: [J, 3] posed joints, metres.
+        inverses: [J, 3, 4] inverses of their transforms.
+    """
+
+    joints: Float[Tensor, "J 3"]
+    inverses: Float[Tensor, "J 3 4"]
+
+    @classmethod
+    def of(cls, joints: Float[Tensor, "J 3"], transforms: Float[Tensor, "J 4 4"]) -> "Bones":
+        """Bones of a pose."""
+        inverse, _ = invert_affine(transforms)
+        return cls(joints.contiguous(), inverse[:, :3].contiguous())
+
+    def guess(self, points: Float[Tensor, "n 3"], rank: int) -> Float[Tensor, "n 3"]:
+        """Points under the inverse of the bone whose joint is the ``rank``-th nearest."""
+        gap = (points[:, None] - self.joints).square().sum(-1)
+        nearest = gap.argsort(dim=1, stable=True)[:, min(rank, gap.shape[1] - 1)]
+        inverse = self.inverses[nearest]
+        return apply_linear(inverse[..., :3], points) + inverse[..., 3]
 
 
 def vertex_maps(
@@ -245,63 +289,58 @@ def _discs(tris: Tensor) -> Tensor:
     return torch.stack([disc, torch.nn.functional.pad(normal, (0, 1))], 1).contiguous()
 
 
-def vertex_inverses(
-    field: SkinningField, maps: Float[Tensor, "V 3 4"]
-) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 3 3"]]:
-    """Skinned rest vertices and the inverse Jacobian of the field at them, mean of the faces around."""
-    images = (maps[..., :3] * field.rest[:, None, :]).sum(-1) + maps[..., 3]
-    inverse, _ = invert_linear(maps[..., :3], MIN_DET)
-    return images, inverse
-
-
 def guess_warp(
-    field: SkinningField, points: Tensor, maps: Tensor, max_distance: float
-) -> tuple[Tensor, Tensor]:
-    """First guesses [N, 3] by a voxel look-up of the nearest posed vertex, and where there is one."""
+    field: SkinningField,
+    points: Float[Tensor, "n 3"],
+    maps: Float[Tensor, "V 3 4"],
+    max_distance: float,
+) -> Float[Tensor, "n 3"]:
+    """First guesses: the inverse map of the posed vertex that the voxel of a point names.
+
+    Where the voxel is empty it is a corner of the closest posed face within twice ``max_distance``,
+    beyond that the point itself.
+    """
     from .kernels.launch import launch, launch_one, view
     from .kernels.newton import EMPTY, first_guess, splat_verts
 
-    count, lists = len(points), field.near_lists()
-    skinned, inverse = vertex_inverses(field, maps)
-    skinned, inverse = skinned.contiguous(), inverse.contiguous()
+    rest = field.rest.detach().contiguous()
+    skinned = ((maps[..., :3] * rest[:, None, :]).sum(-1) + maps[..., 3]).contiguous()
+    inverse, _ = invert_linear(maps[..., :3], MIN_DET)
+    inverse = inverse.contiguous()
     low, high = skinned.amin(0), skinned.amax(0)
-    # the reach is kept free around the body; frame = corner and voxel size, which stay on the device
-    voxel = ((high - low).amax() / (_GRID - 2 * math.ceil(_SPLAT))).clamp(min=1e-3)
-    frame = torch.cat([low - math.ceil(_SPLAT) * voxel, voxel[None]])
+    # corner and voxel size stay on the device; the reach is kept free around the body
+    border = math.ceil(_SPLAT)
+    voxel = ((high - low).amax() / (_GRID - 2 * border)).clamp(min=1e-3)
+    frame = torch.cat([low - border * voxel, voxel[None]])
     nearest = torch.full((_GRID**3,), EMPTY, device=points.device)
     args = [view(skinned, 3), view(frame), _GRID, _SPLAT, view(nearest)]
     launch_one(splat_verts, len(skinned), args, points)
     posed = field.posed_index(skinned)
+    faces = field.near_lists()["faces"]
     guess = torch.zeros_like(points)
-    known = torch.zeros(count, dtype=torch.bool, device=points.device)
-    rest = field.rest.detach().contiguous()
-    args = [view(points, 3), view(frame), _GRID, view(nearest), _mesh_id(posed)]
-    args += [view(lists["faces"], 3), min(2 * max_distance, 1e10), view(rest, 3), view(skinned, 3)]
-    launch(first_guess, count, [*args, view(inverse, 3), view(guess, 3), view(known)], points)
-    return guess, known
+    args = [view(points, 3), view(frame), _GRID, view(nearest), _mesh_id(posed), view(faces, 3)]
+    args += [min(2 * max_distance, 1e10), view(rest, 3), view(skinned, 3), view(inverse, 3)]
+    launch(first_guess, len(points), [*args, view(guess, 3)], points)
+    return guess
 
 
 def newton_warp(
     field: SkinningField,
-    points: Tensor,
-    maps: Tensor,
-    guess: Tensor,
-    iterations: int,
-    max_distance: float,
-    gradients: bool = True,
-    bones: tuple[Tensor, Tensor] | None = None,
-    starts: int = 1,
-) -> tuple[Roots, Tensor]:
-    """All iterations of every point in one kernel: Newton, or re-queries without ``gradients``.
+    points: Float[Tensor, "n 3"],
+    maps: Float[Tensor, "V 3 4"],
+    bones: Bones,
+    plan: Plan,
+    guess: Float[Tensor, "n 3"] | None = None,
+) -> tuple[Roots, Float[Tensor, "n J"]]:
+    """All starts and iterations of a point in one thread of one kernel.
 
     Args:
         field: the forward field, with the warp back end.
         points: [N, 3] float32 targets in pose space, finite.
-        maps: [V, 3, 4] float32 blended maps of the vertices.
-        guess: [N, 3] first rest points.
-        iterations: steps.
-        max_distance: rest points farther than this from the surface end the search, metres.
-        gradients: whether the Jacobian has the term of the changing weights.
+        maps: blended maps of the vertices.
+        bones: for the starts after the first.
+        plan: how to search.
+        guess: first rest points; None looks them up.
 
     Returns:
         The roots, and their weights [N, J].
@@ -309,20 +348,21 @@ def newton_warp(
     from .kernels.launch import launch, view
     from .kernels.newton import solve
 
+    points, maps = points.contiguous(), maps.contiguous()
+    if guess is None:
+        guess = guess_warp(field, points, maps, plan.max_distance)
     count, device, lists = len(points), points.device, field.near_lists()
     rest = torch.zeros_like(points)
     weights = torch.zeros(count, field.weights.shape[1], device=device)
     face = torch.zeros(count, dtype=torch.int32, device=device)
     residual = torch.zeros(count, device=device)
     invertible = torch.zeros(count, dtype=torch.bool, device=device)
+    limits = (plan.stop, ARRIVED, MIN_DET, min(plan.max_distance, 1e10))
     args = [view(points, 3), view(guess, 3), _mesh_id(field.index), view(lists["tris"], 3)]
-    args += [view(lists["discs"], 4)]
-    args += [view(lists["faces"], 3), lists["lo"], lists["dims"], lists["voxel"]]
-    args += [view(lists["slots"]), view(lists["face"]), view(lists["gap"]), view(maps, 4)]
-    none = (maps.new_zeros(0, 3), maps.new_zeros(0, 3, 4))
-    joints, inverses = none if bones is None else bones
-    args += [view(lists["weights"]), view(joints, 3), view(inverses, 4), starts]
-    args += [iterations, int(gradients), (STOP, ARRIVED, MIN_DET, min(max_distance, 1e10))]
+    args += [view(lists["discs"], 4), view(lists["faces"], 3), lists["lo"], lists["dims"]]
+    args += [lists["voxel"], view(lists["slots"]), view(lists["face"]), view(lists["gap"])]
+    args += [view(maps, 4), view(lists["weights"]), view(bones.joints, 3), view(bones.inverses, 4)]
+    args += [plan.starts, plan.iterations, int(plan.gradients), limits]
     out = [view(rest, 3), view(weights), view(face), view(residual), view(invertible)]
     launch(solve, count, [*args, *out], points)
     residual = torch.where(face >= 0, residual, math.inf)
@@ -331,43 +371,62 @@ def newton_warp(
 
 def newton_torch(
     field: SkinningField,
-    points: Tensor,
-    maps: Tensor,
-    guess: Tensor,
-    iterations: int,
-    max_distance: float,
-    gradients: bool = True,
+    points: Float[Tensor, "n 3"],
+    maps: Float[Tensor, "V 3 4"],
+    bones: Bones,
+    plan: Plan,
+    guess: Float[Tensor, "n 3"],
 ) -> Roots:
-    """The plain twin of :func:`newton_warp`, in the dtype of the input; keeps the best iterate."""
-    rest, best = guess.clone(), _start(guess)
-    for step in range(iterations + 1):
-        hit = field.index.query(rest, max_distance)
-        at = field_at(rest, hit.face, field.rest, field.faces, maps)
-        error = points - at.image
-        residual = torch.where(hit.found, error.norm(dim=-1), math.inf)
-        blended_inverse, ok = invert_linear(at.linear, MIN_DET)
-        best = keep_better(best, Roots(rest, hit.face, residual, ok))
-        if step == iterations or bool((best.residual <= STOP).all()):
-            break
-        move = apply_linear(blended_inverse, error)
-        if gradients:
-            inverse, full = invert_linear(field_jacobian(at), MIN_DET)
-            move = torch.where(full[:, None], apply_linear(inverse, error), move)
-            ok = ok | full
-        size = move.norm(dim=-1, keepdim=True)
-        move = move * (LONGEST_STEP / size.clamp(min=LONGEST_STEP))
-        active = ok & hit.found & (best.residual > STOP)
-        rest = torch.where(active[:, None], rest + move, rest)
+    """The plain twin of :func:`newton_warp`, in the dtype of the input."""
+    best = nowhere(guess)
+    for start in range(min(plan.starts, bones.joints.shape[0] + 1)):
+        todo = (best.residual > ARRIVED).nonzero().squeeze(-1)
+        first = guess if start == 0 else bones.guess(points, start - 1)
+        found = _descend(field, points[todo], maps, plan, first[todo])
+        best = keep_better(best, _spread(found, todo, best))
     return best
 
 
-def _start(guess: Tensor) -> Roots:
-    count, device = len(guess), guess.device
+def _descend(
+    field: SkinningField, points: Tensor, maps: Tensor, plan: Plan, guess: Tensor
+) -> Roots:
+    """One start: Newton steps (or re-queries) that keep the best iterate."""
+    rest, best = guess, nowhere(guess)
+    for step in range(plan.iterations + 1):
+        hit = field.index.query(rest, plan.max_distance)
+        at = field_at(rest, hit.face, field.rest, field.faces, maps)
+        error = points - at.image
+        residual = torch.where(hit.found, error.norm(dim=-1), math.inf)
+        inverse, ok = invert_linear(at.linear, MIN_DET)
+        best = keep_better(best, Roots(rest, hit.face, residual, ok))
+        active = hit.found & (best.residual > plan.stop)
+        if step == plan.iterations or not bool(active.any()):
+            break
+        if plan.gradients:
+            full, regular = invert_linear(field_jacobian(at), MIN_DET)
+            inverse = torch.where(regular[:, None, None], full, inverse)
+            ok = ok | regular
+        move = apply_linear(inverse, error)
+        move = move * (LONGEST_STEP / move.norm(dim=-1, keepdim=True).clamp(min=LONGEST_STEP))
+        rest = torch.where((active & ok)[:, None], rest + move, rest)
+    return best
+
+
+def nowhere(guess: Float[Tensor, "n 3"]) -> Roots:
+    """Roots that anything is better than."""
+    face = torch.zeros(len(guess), dtype=torch.long, device=guess.device)
+    residual = torch.full((len(guess),), math.inf, dtype=guess.dtype, device=guess.device)
+    return Roots(guess.clone(), face, residual, torch.zeros_like(face, dtype=torch.bool))
+
+
+def _spread(found: Roots, rows: Tensor, old: Roots) -> Roots:
+    """Roots of some rows among all rows, elsewhere nothing."""
+    all_rows = nowhere(old.points)
     return Roots(
-        guess,
-        torch.zeros(count, dtype=torch.long, device=device),
-        torch.full((count,), math.inf, dtype=guess.dtype, device=device),
-        torch.zeros(count, dtype=torch.bool, device=device),
+        all_rows.points.index_copy(0, rows, found.points),
+        all_rows.face.index_copy(0, rows, found.face),
+        all_rows.residual.index_copy(0, rows, found.residual),
+        all_rows.invertible.index_copy(0, rows, found.invertible),
     )
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +18,6 @@ from .animate import as_uint8, pose_of, turntable_views
 from .avatar import Avatar, View
 from .captures import check_capture, describe, read_capture
 from .config import Config
-from .evaluate import Evaluation
 from .explain import print_skipping, why_empty
 from .progress import counted, progress_bar
 from .render import Picture, render_view, render_views

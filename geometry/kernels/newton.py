@@ -243,7 +243,6 @@ def first_guess(
     skinned: wp.array(dtype=wp.vec3),
     inverse: wp.array2d(dtype=wp.vec3),
     guess: wp.array(dtype=wp.vec3),
-    known: wp.array(dtype=wp.bool),
 ):
     """Rest point by the local inverse of the vertex that the voxel names, or of the closest face."""
     i = start + wp.tid()
@@ -264,7 +263,6 @@ def first_guess(
                 v = corner[0]
             elif query.v >= 1.0 - query.u - query.v:
                 v = corner[1]
-    known[i] = v >= 0
     p = x
     if v >= 0:
         e = x - skinned[v]

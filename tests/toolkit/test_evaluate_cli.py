@@ -16,7 +16,6 @@ from monopart.toolkit.lpips import load_lpips
 from monopart.toolkit.report_content import capture_facts
 from monopart.toolkit.runs import open_run
 
-
 pytestmark = pytest.mark.usefixtures("short_strip")
 
 

@@ -1,0 +1,319 @@
+"""Inverse skinning: from posed points back to the shaped rest pose, by five methods.
+
+The forward map is x = sum over j of w_j(p) T_j p, with w(p) the weights of the rest-surface point closest to p.
+Reference: X. Chen et al., Fast-SNARF, 2023 (root finding from several starts); the methods here are own code.
+"""
+
+import math
+import weakref
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from .body import BodyModel, PosedBody
+from .errors import InputError
+from .rigid import append_last_row, apply_linear, invert_linear
+from .skinning import blend_transforms, unskin
+from .surface import closest_on_triangle
+from .unskin_newton import (
+    ARRIVED,
+    MIN_DET,
+    Bones,
+    Plan,
+    Roots,
+    SkinningField,
+    field_at,
+    field_jacobian,
+    keep_better,
+    newton_torch,
+    newton_warp,
+    nowhere,
+    vertex_maps,
+)
+
+_ITERATIONS = {"nearest": 0, "surface": 0, "fixed_point": 5, "broyden": 20, "newton": 8}
+_STARTS = {"nearest": 1, "surface": 1, "fixed_point": 1, "broyden": 1, "newton": 4}
+_PAIRS = 1 << 24  # (point, vertex) pairs of one step of the nearest-vertex search
+_FIELDS: "weakref.WeakKeyDictionary[BodyModel, SkinningField]" = weakref.WeakKeyDictionary()
+
+
+@dataclass(frozen=True)
+class Unskinned:
+    """Rest-space points of posed points.
+
+    Attributes:
+        points: [N, 3] points in the space of the shaped rest pose, metres; the best that was found where not valid.
+        weights: [N, J] skinning weights that take them back.
+        residual: [N] cycle error, metres: distance of the target and of the point skinned with the weights
+            looked up again at it; infinite where the rest surface is out of reach. Not differentiable.
+        valid: [N] residual <= 1 mm and the map at the point has an inverse.
+    """
+
+    points: Float[Tensor, "n 3"]
+    weights: Float[Tensor, "n J"]
+    residual: Float[Tensor, "n"]
+    valid: Bool[Tensor, "n"]
+
+
+def inverse_skin(
+    points: Float[Tensor, "n 3"],
+    posed: PosedBody,
+    body: BodyModel,
+    method: str = "newton",
+    *,
+    rest_verts: Float[Tensor, "V 3"] | SkinningField | None = None,
+    max_distance: float = 0.2,
+    starts: int | None = None,
+    iterations: int | None = None,
+) -> Unskinned:
+    """Find the rest points that linear blend skinning moves to given posed points.
+
+    Args:
+        points: targets in local pose space (``posed.to_local`` of world points), metres.
+        posed: the body, unbatched.
+        body: its model.
+        method: "nearest" (weights of the nearest posed vertex), "surface" (weights of the closest posed surface
+            point), "fixed_point" (surface, then the weights are looked up again at the rest point), "broyden"
+            (quasi-Newton in batched torch) or "newton" (voxel look-up of a first guess, then Newton steps with
+            the analytic Jacobian; one kernel for all).
+        rest_verts: shaped rest vertices ``body.shaped(betas)[0]``, or a :class:`SkinningField` that holds them
+            and names a back end; None is the mean shape, ``body.v_template``. The search structures of the last
+            shape of a body are kept.
+        max_distance: rest points farther than this from the rest surface are not valid, metres.
+        starts: first guesses: one from the posed surface, the others from the inverses of the nearest bones.
+            Broyden runs them all and keeps the best, newton and fixed_point try the next where the last one
+            failed. None: newton 4, else 1.
+        iterations: steps of one start. None: fixed_point 5, newton 8, broyden 20.
+
+    Returns:
+        Points, weights, cycle residual and mask. Points and weights are differentiable in `points`, in
+        ``posed.transforms`` and in `rest_verts`: the three iterative methods by the implicit function theorem
+        where valid (no gradient elsewhere), the others directly.
+
+    Raises:
+        InputError: unknown method, batched body, tensors that do not fit together, a limit that is not positive.
+
+    Reference:
+        X. Chen et al., Fast-SNARF, 2023, section 3 (several starts).
+
+    >>> from .body import BodyPose
+    >>> body = BodyModel.default()
+    >>> posed = body(BodyPose.zeros(body))
+    >>> found = inverse_skin(body.v_template[:4] + 0.001, posed, body, "surface")
+    >>> found.valid.tolist()
+    [True, True, True, True]
+    """
+    plan = _plan(method, max_distance, starts, iterations, points.dtype)
+    field, rest = _field(points, posed, body, rest_verts)
+    with torch.no_grad():
+        sound = points.isfinite().all(-1) & posed.transforms.isfinite().all()
+        sound = sound & posed.verts.isfinite().all()
+    identity = torch.eye(4, dtype=points.dtype, device=points.device)
+    # one bad number would spread through the search structures: such input is replaced, then masked
+    whole = posed.transforms.isfinite().all()
+    posed = replace(
+        posed,
+        transforms=torch.where(whole, posed.transforms, identity),
+        verts=torch.where(posed.verts.isfinite(), posed.verts, 0.0),
+        joints=torch.where(posed.joints.isfinite(), posed.joints, 0.0),
+    )
+    targets = torch.where(sound[:, None], points, 0.0)
+    if method in ("nearest", "surface"):
+        found = _direct(targets, posed, field, method, plan)
+    else:
+        found = _iterative(targets, posed, field, rest, method, plan)
+    return Unskinned(
+        found.points,
+        found.weights,
+        torch.where(sound, found.residual, math.inf),
+        found.valid & sound,
+    )
+
+
+def _plan(
+    method: str, max_distance: float, starts: int | None, iterations: int | None, dtype: torch.dtype
+) -> Plan:
+    if method not in _ITERATIONS:
+        raise InputError(f"method: expected one of {', '.join(_ITERATIONS)}, found {method!r}")
+    starts = _STARTS[method] if starts is None else starts
+    iterations = _ITERATIONS[method] if iterations is None else iterations
+    for name, value, least in (("starts", starts, 1), ("iterations", iterations, 0)):
+        if value < least:
+            raise InputError(f"{name}: expected at least {least}, found {value}; or pass None")
+    if not max_distance > 0:
+        raise InputError(f"max_distance: expected metres > 0, found {max_distance}; use 0.2")
+    stop = 5e-6 if dtype == torch.float32 else 1e-10
+    return Plan(iterations, starts, max_distance, stop, method == "newton")
+
+
+def _field(
+    points: Tensor,
+    posed: PosedBody,
+    body: BodyModel,
+    rest_verts: "Tensor | SkinningField | None",
+) -> tuple[SkinningField, Tensor]:
+    """The forward field, and the rest vertices that gradients go to."""
+    if posed.transforms.ndim != 3 or posed.transforms.shape[0] != body.num_joints:
+        raise InputError(
+            f"posed: expected one body with {body.num_joints} joints, found transforms of shape "
+            f"{tuple(posed.transforms.shape)}; pass one body of the batch, posed by this model"
+        )
+    body = body.to(points)
+    rest = rest_verts.rest if isinstance(rest_verts, SkinningField) else rest_verts
+    rest = body.v_template if rest is None else rest
+    for name, other in (("posed", posed.transforms), ("rest_verts", rest)):
+        if other.dtype != points.dtype or other.device != points.device:
+            raise InputError(
+                f"{name}: expected dtype and device of points ({points.dtype}, {points.device}), "
+                f"found {other.dtype}, {other.device}; convert one of them"
+            )
+    if isinstance(rest_verts, SkinningField):
+        return rest_verts, rest
+    kept = _FIELDS.get(body)
+    if kept is None or not torch.equal(kept.rest, rest.detach()):
+        kept = SkinningField(body, rest.detach().clone())
+        _FIELDS[body] = kept
+    return kept, rest
+
+
+def _direct(
+    points: Tensor, posed: PosedBody, field: SkinningField, method: str, plan: Plan
+) -> Unskinned:
+    """One look-up of the weights on the posed body, one inverse."""
+    if method == "nearest":
+        weights = field.weights[_nearest_vertex(points, posed.verts)]
+    else:
+        hit = field.posed_index(posed.verts).query(points)
+        weights = field.mix(hit.face, hit.bary)
+    rest, ok = unskin(points, blend_transforms(posed.transforms, weights), MIN_DET)
+    with torch.no_grad():
+        maps = vertex_maps(posed.transforms, field.weights)
+        hit = field.index.query(rest.detach(), plan.max_distance)
+        image = field_at(rest, hit.face, field.rest, field.faces, maps).image
+        residual = torch.where(hit.found, (image - points).norm(dim=-1), math.inf)
+    return Unskinned(rest, weights, residual, ok & (residual <= ARRIVED))
+
+
+def _nearest_vertex(points: Tensor, verts: Tensor) -> Tensor:
+    with torch.no_grad():
+        step = max(1, _PAIRS // verts.shape[0])
+        parts = [torch.cdist(chunk, verts).argmin(1) for chunk in points.split(step)]
+    return torch.cat(parts)
+
+
+def _iterative(
+    points: Tensor, posed: PosedBody, field: SkinningField, rest: Tensor, method: str, plan: Plan
+) -> Unskinned:
+    """Search without gradients, then attach them at the solution."""
+    maps = vertex_maps(posed.transforms, field.weights)
+    with torch.no_grad():
+        x, still = points.detach(), maps.detach()
+        bones = Bones.of(posed.joints.detach(), posed.transforms.detach())
+        weights = None
+        if method == "newton" and field.backend == "warp" and x.dtype == torch.float32:
+            roots, weights = newton_warp(field, x, still, bones, plan)
+        else:
+            guess = _surface_guess(x, posed, field)
+            roots = _search(method, field, x, still, bones, plan, guess)
+            weights = _weights(field, roots.points, roots.face, field.rest)
+        weights = weights * roots.residual.isfinite()[:, None]
+        valid = roots.invertible & (roots.residual <= ARRIVED)
+    wanted = points.requires_grad or maps.requires_grad or rest.requires_grad
+    if not (torch.is_grad_enabled() and wanted):
+        return Unskinned(roots.points, weights, roots.residual, valid)
+    at = field_at(roots.points, roots.face, rest, field.faces, maps)
+    inverse, ok = invert_linear(field_jacobian(at).detach(), MIN_DET)
+    # p - J^-1 (f(p) - x) with p and J held: its first derivatives are those of the root
+    step = apply_linear(inverse, points - at.image)
+    step = torch.where((ok & valid)[:, None], step - step.detach(), 0.0)
+    moved = roots.points + step
+    exact = _weights(field, moved, roots.face, rest)
+    weights = weights + torch.where((ok & valid)[:, None], exact - exact.detach(), 0.0)
+    return Unskinned(moved, weights, roots.residual, valid)
+
+
+def _weights(field: SkinningField, points: Tensor, face: Tensor, rest: Tensor) -> Tensor:
+    return field.mix(face, closest_on_triangle(points, rest[field.faces[face]]))
+
+
+def _surface_guess(points: Tensor, posed: PosedBody, field: SkinningField) -> Tensor:
+    """The result of the method "surface"."""
+    hit = field.posed_index(posed.verts.detach()).query(points)
+    maps = vertex_maps(posed.transforms.detach(), field.weights)
+    blended = (maps[field.faces[hit.face]] * hit.bary[..., None, None]).sum(1)
+    return unskin(points, append_last_row(blended), MIN_DET)[0]
+
+
+def _search(
+    method: str,
+    field: SkinningField,
+    points: Tensor,
+    maps: Tensor,
+    bones: Bones,
+    plan: Plan,
+    guess: Tensor,
+) -> Roots:
+    if method != "broyden":
+        fast = field.backend == "warp" and points.dtype == torch.float32
+        if fast:
+            return newton_warp(field, points, maps, bones, plan, guess.contiguous())[0]
+        return newton_torch(field, points, maps, bones, plan, guess)
+    best = nowhere(guess)
+    for start in range(min(plan.starts, bones.joints.shape[0] + 1)):
+        first = guess if start == 0 else bones.guess(points, start - 1)
+        best = keep_better(best, _broyden(field, points, maps, plan, first))
+    return best
+
+
+def _broyden(
+    field: SkinningField, points: Tensor, maps: Tensor, plan: Plan, guess: Tensor
+) -> Roots:
+    """Broyden's method from one start; points that arrived leave the batch.
+
+    Reference: C. G. Broyden, A class of methods for solving nonlinear simultaneous equations, 1965 (the
+    inverse form, by Sherman and Morrison).
+    """
+    best = nowhere(guess)
+    rows = torch.arange(len(points), device=points.device)
+    rest, inverse, move, error = guess, None, None, None
+    for step in range(plan.iterations + 1):
+        hit = field.index.query(rest, plan.max_distance)
+        at = field_at(rest, hit.face, field.rest, field.faces, maps)
+        new_error = at.image - points[rows]
+        residual = torch.where(hit.found, new_error.norm(dim=-1), math.inf)
+        start_inverse, ok = invert_linear(at.linear, MIN_DET)
+        _store(best, rows, Roots(rest, hit.face, residual, ok))
+        if inverse is None or move is None or error is None:
+            inverse = start_inverse
+        else:
+            inverse = _rank_one(inverse, move, new_error - error)
+        go = hit.found & (residual > plan.stop)
+        if step == plan.iterations or not bool(go.any()):
+            break
+        rows, inverse, error = rows[go], inverse[go], new_error[go]
+        move = -apply_linear(inverse, error)
+        move = move * (0.2 / move.norm(dim=-1, keepdim=True).clamp(min=0.2))
+        rest = rest[go] + move
+    return best
+
+
+def _rank_one(inverse: Tensor, move: Tensor, change: Tensor) -> Tensor:
+    """Smallest change of an inverse Jacobian that explains the last step; none where that is ill-defined."""
+    guess = apply_linear(inverse, change)
+    left = apply_linear(inverse.mT, move)
+    scale = (move * guess).sum(-1)
+    safe = scale.abs() > 1e-3 * move.square().sum(-1)
+    gain = torch.where(safe, 1.0, 0.0) / torch.where(safe, scale, 1.0)
+    return inverse + (move - guess)[:, :, None] * left[:, None, :] * gain[:, None, None]
+
+
+def _store(best: Roots, rows: Tensor, new: Roots) -> None:
+    """Write what is better into the best roots, in place."""
+    take = new.residual < best.residual[rows]
+    rows = rows[take]
+    best.face[rows] = new.face[take]
+    best.residual[rows] = new.residual[take]
+    best.invertible[rows] = new.invertible[take]
+    best.points[rows] = new.points[take]
