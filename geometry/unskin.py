@@ -1,7 +1,8 @@
 """Inverse skinning: from posed points back to the shaped rest pose, by five methods.
 
-The forward map is x = sum over j of w_j(p) T_j p, with w(p) the weights of the rest-surface point closest to p.
-Reference: X. Chen et al., Fast-SNARF, 2023 (root finding from several starts); the methods here are own code.
+The forward map is x = sum over j of w_j(p) T_j p, with w(p) the weights of the point of the rest
+surface that is closest to p. Reference: X. Chen et al., Fast-SNARF, 2023 (root finding from several
+starts); the methods here are own code.
 """
 
 import math
@@ -16,6 +17,7 @@ from .body import BodyModel, PosedBody
 from .errors import InputError
 from .rigid import append_last_row, apply_linear, invert_linear
 from .skinning import blend_transforms, unskin
+from .skinning_field import SkinningField, field_at, field_jacobian, vertex_maps
 from .surface import closest_on_triangle
 from .unskin_newton import (
     ARRIVED,
@@ -23,18 +25,14 @@ from .unskin_newton import (
     Bones,
     Plan,
     Roots,
-    SkinningField,
-    field_at,
-    field_jacobian,
     keep_better,
     newton_torch,
     newton_warp,
     nowhere,
-    vertex_maps,
 )
 
 _ITERATIONS = {"nearest": 0, "surface": 0, "fixed_point": 5, "broyden": 20, "newton": 8}
-_STARTS = {"nearest": 1, "surface": 1, "fixed_point": 1, "broyden": 1, "newton": 4}
+_STARTS = {"nearest": 1, "surface": 1, "fixed_point": 1, "broyden": 1, "newton": 6}
 _PAIRS = 1 << 24  # (point, vertex) pairs of one step of the nearest-vertex search
 _FIELDS: "weakref.WeakKeyDictionary[BodyModel, SkinningField]" = weakref.WeakKeyDictionary()
 
@@ -44,10 +42,12 @@ class Unskinned:
     """Rest-space points of posed points.
 
     Attributes:
-        points: [N, 3] points in the space of the shaped rest pose, metres; the best that was found where not valid.
+        points: [N, 3] points in the space of the shaped rest pose, metres; where not valid, the
+            best that was found.
         weights: [N, J] skinning weights that take them back.
-        residual: [N] cycle error, metres: distance of the target and of the point skinned with the weights
-            looked up again at it; infinite where the rest surface is out of reach. Not differentiable.
+        residual: [N] cycle error, metres: distance of the target and of the point skinned with the
+            weights looked up again at it; infinite where the rest surface is out of reach. Not
+            differentiable.
         valid: [N] residual <= 1 mm and the map at the point has an inverse.
     """
 
@@ -74,26 +74,26 @@ def inverse_skin(
         points: targets in local pose space (``posed.to_local`` of world points), metres.
         posed: the body, unbatched.
         body: its model.
-        method: "nearest" (weights of the nearest posed vertex), "surface" (weights of the closest posed surface
-            point), "fixed_point" (surface, then the weights are looked up again at the rest point), "broyden"
-            (quasi-Newton in batched torch) or "newton" (voxel look-up of a first guess, then Newton steps with
-            the analytic Jacobian; one kernel for all).
-        rest_verts: shaped rest vertices ``body.shaped(betas)[0]``, or a :class:`SkinningField` that holds them
-            and names a back end; None is the mean shape, ``body.v_template``. The search structures of the last
-            shape of a body are kept.
+        method: "nearest" (weights of the nearest posed vertex), "surface" (weights of the closest
+            posed surface point), "fixed_point" (surface, then the weights are looked up again at
+            the rest point), "broyden" (quasi-Newton in batched torch) or "newton" (voxel look-up of
+            a first guess, then Newton steps with the analytic Jacobian, one kernel for all).
+        rest_verts: shaped rest vertices ``body.shaped(betas)[0]``, or a `SkinningField` that holds
+            them and names a back end; None is the mean shape, ``body.v_template``. The search
+            structures of the last shape of a body are kept.
         max_distance: rest points farther than this from the rest surface are not valid, metres.
-        starts: first guesses: one from the posed surface, the others from the inverses of the nearest bones.
-            Broyden runs them all and keeps the best, newton and fixed_point try the next where the last one
-            failed. None: newton 4, else 1.
+        starts: first guesses: one from the posed surface, the others by the inverses of the nearest
+            bones. Broyden runs them all and keeps the best; newton and fixed_point try the next
+            where the last one failed; nearest and surface have one. None: newton 6, else 1.
         iterations: steps of one start. None: fixed_point 5, newton 8, broyden 20.
 
     Returns:
-        Points, weights, cycle residual and mask. Points and weights are differentiable in `points`, in
-        ``posed.transforms`` and in `rest_verts`: the three iterative methods by the implicit function theorem
-        where valid (no gradient elsewhere), the others directly.
+        Points, weights, cycle residual and mask. Points and weights are differentiable in `points`,
+        in ``posed.transforms`` and in `rest_verts`: the three iterative methods by the implicit
+        function theorem where valid (no gradient elsewhere), the others directly.
 
     Raises:
-        InputError: unknown method, batched body, tensors that do not fit together, a limit that is not positive.
+        InputError: unknown method, batched body, tensors that do not fit together, bad limits.
 
     Reference:
         X. Chen et al., Fast-SNARF, 2023, section 3 (several starts).
@@ -272,8 +272,8 @@ def _broyden(
 ) -> Roots:
     """Broyden's method from one start; points that arrived leave the batch.
 
-    Reference: C. G. Broyden, A class of methods for solving nonlinear simultaneous equations, 1965 (the
-    inverse form, by Sherman and Morrison).
+    Reference: C. G. Broyden, A class of methods for solving nonlinear simultaneous equations, 1965
+    (the inverse form, by Sherman and Morrison).
     """
     best = nowhere(guess)
     rows = torch.arange(len(points), device=points.device)
@@ -300,7 +300,7 @@ def _broyden(
 
 
 def _rank_one(inverse: Tensor, move: Tensor, change: Tensor) -> Tensor:
-    """Smallest change of an inverse Jacobian that explains the last step; none where that is ill-defined."""
+    """Smallest change of an inverse Jacobian that explains the last step, where defined."""
     guess = apply_linear(inverse, change)
     left = apply_linear(inverse.mT, move)
     scale = (move * guess).sum(-1)

@@ -3,6 +3,7 @@
 Nothing heavy is imported here: help must be there at once, and an extra that is missing is said.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 
@@ -22,6 +23,8 @@ def main(argv: Sequence[str] | None = None) -> int | None:
     Returns:
         Exit code: None or 0 when all is well, 2 for bad input, 130 after an interrupt.
     """
+    # Threads that wait must sleep, not spin: a busy machine would otherwise stall at each barrier.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         from .arguments import parse
 

@@ -129,6 +129,8 @@ def _trained(
         torch.manual_seed(config.seed)
         avatar = Avatar.create(record, config)
         trainer = Trainer(avatar, run)
+    with stages.timed("kernels (compiled once per machine)"):
+        trainer.warm_up()
     say(f"{record.name}: training preset {config.preset} on {len(trainer.cameras)} images")
     interrupted = _run_loop(trainer)
     stages.seconds["training"] = trainer.result.seconds

@@ -56,7 +56,7 @@ def _plain(title: str) -> Update:
         if elapsed - shown[0] < PLAIN_EVERY and done < 1.0:
             return
         shown[0] = elapsed
-        left = f", {elapsed / done - elapsed:.0f} s left" if done > 0 else ""
+        left = f", {elapsed / done - elapsed:.0f} s left" if done > 0.001 else ""
         line = f"{title}: {done:4.0%}, {elapsed:.0f} s{left}  {note}".rstrip()
         print(line, file=sys.stderr, flush=True)
 

@@ -1,202 +1,19 @@
-"""Warp kernels of inverse skinning: near-face lists, first guesses, and the whole solve of a point in one thread."""
+"""Warp kernels of inverse skinning: first guesses, and the whole solve of a point in one thread."""
+
+# ruff: noqa: PLR0915, C901 - one kernel holds the loop: a call per step would copy its state
 
 from typing import no_type_check
 
 import warp as wp
 
+from .near_faces import bary_on_triangle, closest_face
 from .shell import voxel_of
 
-wp.set_module_options(
-    {"enable_backward": False}
-)  # gradients come from the implicit function theorem
+wp.set_module_options({"enable_backward": False})  # gradients: the implicit function theorem
 
 _KEY = wp.constant(wp.int64(1 << 32))
 EMPTY = (1 << 63) - 1
 _EMPTY = wp.constant(wp.int64(EMPTY))
-
-
-@no_type_check
-@wp.func
-def bary_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Barycentrics of the nearest point of a triangle; exact zeros on edges and corners.
-
-    C. Ericson, Real-Time Collision Detection, 2005, ch. 5.1.5: at most one division.
-    """
-    ab = b - a
-    ac = c - a
-    ap = p - a
-    d1 = wp.dot(ab, ap)
-    d2 = wp.dot(ac, ap)
-    if d1 <= 0.0 and d2 <= 0.0:
-        return wp.vec3(1.0, 0.0, 0.0)
-    d00 = wp.dot(ab, ab)
-    d01 = wp.dot(ab, ac)
-    d11 = wp.dot(ac, ac)
-    d3 = d1 - d00
-    d4 = d2 - d01
-    if d3 >= 0.0 and d4 <= d3:
-        return wp.vec3(0.0, 1.0, 0.0)
-    d5 = d1 - d01
-    d6 = d2 - d11
-    if d6 >= 0.0 and d5 <= d6:
-        return wp.vec3(0.0, 0.0, 1.0)
-    vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        t = d1 / wp.max(d00, 1.0e-30)
-        return wp.vec3(1.0 - t, t, 0.0)
-    vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        t = d2 / wp.max(d11, 1.0e-30)
-        return wp.vec3(1.0 - t, 0.0, t)
-    va = d3 * d6 - d5 * d4
-    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        t = (d4 - d3) / wp.max((d4 - d3) + (d5 - d6), 1.0e-30)
-        return wp.vec3(0.0, 1.0 - t, t)
-    scale = 1.0 / wp.max(va + vb + vc, 1.0e-30)
-    v = vb * scale
-    w = vc * scale
-    return wp.vec3(1.0 - v - w, v, w)
-
-
-@no_type_check
-@wp.func
-def gap_to_face(p: wp.vec3, tris: wp.array2d(dtype=wp.vec3), f: int):
-    """Distance to one triangle."""
-    a = tris[f, 0]
-    b = tris[f, 1]
-    c = tris[f, 2]
-    w = bary_on_triangle(p, a, b, c)
-    return wp.length(p - a * w[0] - b * w[1] - c * w[2])
-
-
-@no_type_check
-@wp.func
-def centre_of(cell: int, lo: wp.vec3, dims: wp.vec3i, voxel: float):
-    """Centre of a voxel."""
-    x = cell % dims[0]
-    y = (cell // dims[0]) % dims[1]
-    z = cell // (dims[0] * dims[1])
-    return lo + wp.vec3(float(x) + 0.5, float(y) + 0.5, float(z) + 0.5) * voxel
-
-
-@no_type_check
-@wp.kernel
-def mark_near(
-    start: int,
-    mesh: wp.uint64,
-    lo: wp.vec3,
-    dims: wp.vec3i,
-    voxel: float,
-    reach: float,
-    near: wp.array(dtype=wp.bool),
-):
-    """Voxels whose centre is within ``reach`` of the surface."""
-    i = start + wp.tid()
-    query = wp.mesh_query_point_no_sign(mesh, centre_of(i, lo, dims, voxel), reach)
-    near[i] = query.result
-
-
-@no_type_check
-@wp.kernel
-def list_faces(
-    start: int,
-    mesh: wp.uint64,
-    tris: wp.array2d(dtype=wp.vec3),
-    cells: wp.array(dtype=wp.int32),
-    lo: wp.vec3,
-    dims: wp.vec3i,
-    voxel: float,
-    face: wp.array2d(dtype=wp.int32),
-    gap: wp.array2d(dtype=wp.float32),
-):
-    """The faces that can be the closest of any point of a voxel, nearest to its centre first.
-
-    A row that is not full is complete and ends with -1; a full row holds the nearest ones.
-    """
-    i = start + wp.tid()
-    c = centre_of(cells[i], lo, dims, voxel)
-    query = wp.mesh_query_point_no_sign(mesh, c, 1.0e10)
-    limit = gap_to_face(c, tris, query.face) + 1.7321 * voxel + 1.0e-5
-    side = wp.vec3(limit, limit, limit)
-    boxes = wp.mesh_query_aabb(mesh, c - side, c + side)
-    f = int(0)
-    count = int(0)
-    size = face.shape[1]
-    while wp.mesh_query_aabb_next(boxes, f):
-        d = gap_to_face(c, tris, f)
-        if d <= limit and (count < size or d < gap[i, size - 1]):
-            k = wp.min(count, size - 1)
-            while k > 0 and gap[i, wp.max(k - 1, 0)] > d:
-                gap[i, k] = gap[i, k - 1]
-                face[i, k] = face[i, k - 1]
-                k -= 1
-            gap[i, k] = d
-            face[i, k] = f
-            count += 1
-
-
-@no_type_check
-@wp.func
-def out_of_reach(p: wp.vec3, discs: wp.array2d(dtype=wp.vec4), f: int, best: float):
-    """Whether a face is certainly farther than ``best``: by the disc around it, in its plane."""
-    disc = discs[f, 0]
-    normal = discs[f, 1]
-    q = p - wp.vec3(disc[0], disc[1], disc[2])
-    h = wp.dot(q, wp.vec3(normal[0], normal[1], normal[2]))
-    rest = best * best - h * h
-    if rest < -1.0e-12:
-        return True
-    reach = disc[3] + wp.sqrt(wp.max(rest, 0.0))
-    return wp.dot(q, q) - h * h > reach * reach
-
-
-@no_type_check
-@wp.func
-def closest_face(
-    p: wp.vec3,
-    mesh: wp.uint64,
-    tris: wp.array2d(dtype=wp.vec3),
-    discs: wp.array2d(dtype=wp.vec4),
-    lo: wp.vec3,
-    dims: wp.vec3i,
-    voxel: float,
-    slots: wp.array(dtype=wp.int32),
-    near_face: wp.array2d(dtype=wp.int32),
-    near_gap: wp.array2d(dtype=wp.float32),
-    hint: int,
-    max_distance: float,
-):
-    """Closest face by the list of the voxel, exact by the triangle inequality; else by the tree."""
-    best = int(-1)
-    best_gap = max_distance
-    if hint >= 0:
-        d = gap_to_face(p, tris, hint)
-        if d < best_gap:
-            best_gap = d
-            best = hint
-    proven = bool(False)
-    cell = voxel_of(p, lo, dims, 1.0 / voxel)
-    if cell >= 0:
-        slot = slots[cell]
-        if slot >= 0:
-            away = wp.length(p - centre_of(cell, lo, dims, voxel)) + 1.0e-6
-            size = near_face.shape[1]
-            k = int(0)
-            while k < size and not proven:
-                f = near_face[slot, k]
-                if f < 0 or near_gap[slot, k] - away > best_gap:
-                    proven = True
-                elif not out_of_reach(p, discs, f, best_gap):
-                    d = gap_to_face(p, tris, f)
-                    if d < best_gap:
-                        best_gap = d
-                        best = f
-                k += 1
-    if not proven:
-        query = wp.mesh_query_point_no_sign(mesh, p, best_gap)
-        if query.result:
-            best = query.face
-    return best
 
 
 @no_type_check
@@ -209,7 +26,7 @@ def splat_verts(
     reach: float,
     nearest: wp.array(dtype=wp.int64),
 ):
-    """Nearest vertex of every voxel centre within ``reach`` voxels; the key is (distance, vertex)."""
+    """Nearest vertex of voxel centres within ``reach`` voxels; keys are (distance, vertex)."""
     i = start + wp.tid()
     lo = wp.vec3(frame[0], frame[1], frame[2])
     p = (verts[i] - lo) / frame[3] - wp.vec3(0.5, 0.5, 0.5)
@@ -244,7 +61,7 @@ def first_guess(
     inverse: wp.array2d(dtype=wp.vec3),
     guess: wp.array(dtype=wp.vec3),
 ):
-    """Rest point by the local inverse of the vertex that the voxel names, or of the closest face."""
+    """Rest point by the inverse map of the vertex of the voxel, or of the closest face."""
     i = start + wp.tid()
     x = points[i]
     lo = wp.vec3(frame[0], frame[1], frame[2])
@@ -275,7 +92,7 @@ def first_guess(
 @no_type_check
 @wp.func
 def bary_gradients(w: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Gradients of the last two barycentrics of the closest point (the first is minus their sum)."""
+    """Gradients of the last two barycentrics of the closest point (the first: minus their sum)."""
     gb = wp.vec3(0.0, 0.0, 0.0)
     gc = wp.vec3(0.0, 0.0, 0.0)
     ab = b - a
@@ -327,7 +144,9 @@ def blended_row(maps: wp.array2d(dtype=wp.vec4), row: int, v: wp.vec3i, w: wp.ve
 
 @no_type_check
 @wp.func
-def bone_guess(x: wp.vec3, rank: int, joints: wp.array(dtype=wp.vec3), bones: wp.array2d(dtype=wp.vec4)):
+def bone_guess(
+    x: wp.vec3, rank: int, joints: wp.array(dtype=wp.vec3), bones: wp.array2d(dtype=wp.vec4)
+):
     """The point under the inverse of the bone whose joint is the ``rank``-th nearest."""
     floor = float(-1.0)
     chosen = int(0)
@@ -374,8 +193,9 @@ def solve(
 ):
     """Solve x = A(w(p)) p from a guess: Newton steps, or re-queries where ``gradients`` is 0.
 
-    A point that did not arrive starts again from the inverse of its nearest bones. ``limits`` are: residual
-    that ends the iterations, residual that ends the starts, smallest determinant, reach of the rest surface.
+    After a step that did not help, the next one re-queries only. A point that did not arrive starts
+    again from the inverse of its nearest bones. ``limits``: residual that ends the iterations,
+    residual that ends the starts, smallest determinant, reach of the rest surface.
     """
     i = start + wp.tid()
     x = points[i]
@@ -385,6 +205,7 @@ def solve(
     best_face = int(-1)
     best = float(1.0e30)
     best_ok = bool(False)
+    last = float(1.0e30)
     f = int(-1)
     k = int(0)
     attempt = int(0)
@@ -411,6 +232,8 @@ def solve(
             r2 = blended_row(maps, 2, v, w)
             step, det = solve_rows(r0, r1, r2, e)
             ok = wp.abs(det) > limits[2]
+            better = r < last
+            last = r
             if r < best:
                 best = r
                 best_p = p
@@ -418,7 +241,7 @@ def solve(
                 best_face = f
                 best_ok = ok
             over = over or r <= limits[0]
-            if gradients != 0 and not over:
+            if gradients != 0 and better and not over:
                 gb, gc = bary_gradients(w, a, b, c)
                 db = yb - ya
                 dc = yc - ya
@@ -442,6 +265,7 @@ def solve(
                 p = bone_guess(x, attempt - 1, joints, bones)
                 f = -1
                 k = 0
+                last = 1.0e30
     rest[i] = best_p
     face[i] = best_face
     residual[i] = best

@@ -53,7 +53,7 @@ def test_gradients_reach_every_parameter_of_the_parts_in_use() -> None:
 
 
 def test_a_few_steps_fit_a_constant() -> None:
-    field = ResidualField(3)
+    field = ResidualField(3, grid=GridSpec(2, 2, 8, 4, 2.0))
     optimizer = torch.optim.Adam(field.parameters(), 2e-2)
     target = torch.tensor([0.02, -0.01, 0.03])
     for _ in range(30):

@@ -1,4 +1,4 @@
-"""The lens: Jacobian, fold and inverse, against the written-out formula, differences and dense search."""
+"""The lens, its Jacobian, fold and inverse: against the plain formula and dense search."""
 
 import math
 

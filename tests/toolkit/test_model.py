@@ -6,6 +6,7 @@ import pytest
 import torch
 from miniature import write_miniature
 
+from monopart.geometry.errors import MonopartError
 from monopart.toolkit.avatar import Avatar, view_of
 from monopart.toolkit.captures import read_capture
 from monopart.toolkit.checkpoint import load_weights, save_weights
@@ -51,7 +52,7 @@ def test_skipping_does_not_change_the_image(trained: Avatar) -> None:
 
 
 def test_learned_pruning_changes_the_image_little_and_evaluates_less(capture: Path) -> None:
-    avatar = make(capture, small(train={"iterations": 40}))
+    avatar = make(capture, small(train={"iterations": 20}))
     Trainer(avatar).loop()
     view = view_of(avatar.record, 0, 0)
     exact, pruned = render_view(avatar, view), render_view(avatar, view, prune=1e-3)
@@ -97,7 +98,7 @@ def test_forward_makes_no_modules(trained: Avatar) -> None:
 def test_training_lowers_the_loss_and_repeats_bit_for_bit(capture: Path) -> None:
     runs = []
     for _ in range(2):
-        avatar = make(capture, small(train={"iterations": 25, "ema": 0.0}))
+        avatar = make(capture, small(train={"iterations": 12, "ema": 0.0}))
         trainer = Trainer(avatar)
         first = trainer.step(0, 0.0)["mse"]
         trainer.loop()
@@ -130,3 +131,30 @@ def test_other_part_tables_train(capture: Path, parts: str) -> None:
     result = Trainer(avatar).loop()
     assert result.iterations == 2
     assert bool(render_view(avatar, view_of(avatar.record, 0, 0)).color.isfinite().all())
+
+
+def test_warming_up_changes_nothing(capture: Path) -> None:
+    avatar = make(capture, small())
+    trainer = Trainer(avatar)
+    before = {k: v.clone() for k, v in avatar.model.state_dict().items()}
+    state = trainer.generator.get_state()
+    trainer.warm_up()
+    assert all(torch.equal(v, before[k]) for k, v in avatar.model.state_dict().items())
+    assert torch.equal(trainer.generator.get_state(), state)
+    assert all(p.grad is None for p in avatar.model.parameters())
+
+
+def test_a_loss_that_is_not_finite_is_skipped_and_named(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    avatar = make(capture, small(deform={"residual": False}))
+    trainer = Trainer(avatar)
+    nan = torch.tensor(float("nan"), requires_grad=True)
+    monkeypatch.setattr("monopart.toolkit.train.color_loss", lambda *_: nan * 1.0)
+    before = {k: v.clone() for k, v in avatar.model.named_parameters()}
+    trainer.step(0, 0.0)
+    assert all(torch.equal(v, before[k]) for k, v in avatar.model.named_parameters())
+    assert any("mse" in w for w in trainer.result.warnings)
+    with pytest.raises(MonopartError, match="mse"):
+        for step in range(1, 30):
+            trainer.step(step, 0.0)

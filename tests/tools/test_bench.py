@@ -117,18 +117,18 @@ def test_training_and_render_suites(tmp_path: Path, demo_capture: Path) -> None:
     out = tmp_path / "bench"
     data = _run("training", out, str(demo_capture))
     curve = data["tables"][0]
-    assert [r["size"] for r in curve["rows"]][-1] == 2  # two steps
+    assert [r["size"] for r in curve["rows"]] == [2]  # steps
     for row in curve["rows"]:
         assert row["error"] == pytest.approx(10 ** (-row["facts"]["PSNR"] / 20))
     assert (out / "training_cpu.svg").is_file()
 
     record = read_capture(demo_capture)
-    config = with_overrides(preset("tiny"), field={"log2_size": 8})
+    config = with_overrides(preset("tiny"), field={"log2_size": 8, "prior_slope": 0.0})
     run = create_run(tmp_path / "run", config, record)
     save_weights(Avatar.create(record, config).model, run)
     data = _run("render", out, str(run))
     rows = {r["method"]: r for r in data["tables"][0]["rows"]}
-    assert rows["exact skipping"]["error"] < 1e-5
+    assert rows["exact skipping"]["error"] < 1e-4
     assert 0 < rows["exact skipping"]["facts"]["rays %"] <= 100
 
 

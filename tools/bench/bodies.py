@@ -161,7 +161,7 @@ def closest_exact(
     import igl
 
     square, face, on = igl.point_mesh_squared_distance(points, verts, faces)
-    return np.sqrt(square), face, on
+    return np.sqrt(square), np.asarray(face), np.asarray(on)
 
 
 def barycentrics(points: np.ndarray, tris: np.ndarray) -> np.ndarray:
@@ -169,7 +169,7 @@ def barycentrics(points: np.ndarray, tris: np.ndarray) -> np.ndarray:
     import igl
 
     corners = [np.ascontiguousarray(tris[:, i]) for i in range(3)]
-    return igl.barycentric_coordinates(points, *corners)
+    return np.asarray(igl.barycentric_coordinates(points, *corners))
 
 
 def surface_data(

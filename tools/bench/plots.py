@@ -54,7 +54,7 @@ class _Log:
         return powers if len(self.ticks) > 7 and len(powers) > 1 else list(self.ticks)
 
 
-def _axis(values: list[float], start: float, end: float) -> _Log:
+def _axis(values: list[float], start: int, end: int) -> _Log:
     return _Log(tuple(log_ticks(min(values), max(values))), float(start), float(end))
 
 

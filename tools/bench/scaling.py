@@ -54,6 +54,8 @@ class Work:
     """Times the mesh is subdivided."""
     threads: int = 0
     """Threads; 0 leaves them as they are."""
+    prior: bool = True
+    """With the distance prior, which takes seconds to tabulate."""
 
 
 def subdivided(body: BodyModel) -> BodyModel:
@@ -92,7 +94,9 @@ def step_data(body: BodyModel, work: Work) -> StepData:
     from monopart.toolkit.model import AvatarModel, FrameInput
     from monopart.toolkit.presets import preset, with_overrides
 
-    config = with_overrides(preset("fast"), geometry={"step": work.step, "parts": work.parts})
+    field = {} if work.prior else {"prior_slope": 0.0}
+    geometry = {"step": work.step, "parts": work.parts}
+    config = with_overrides(preset("fast"), geometry=geometry, field=field)
     poses = [pose for _, pose in pose_list(body, max(work.frames, 2))][: work.frames]
     batch = BodyPose(
         *(torch.stack([getattr(p, f.name) for p in poses]) for f in dataclasses.fields(BodyPose))
@@ -183,7 +187,7 @@ def _axis(
         for value in quick if settings.quick else values:
             size, label, work = make(value)
             if settings.quick:
-                work = dataclasses.replace(work, rays=min(work.rays, 64))
+                work = dataclasses.replace(work, rays=min(work.rays, 64), prior=False)
             body = BodyModel.default()
             for _ in range(work.levels):
                 body = subdivided(body)

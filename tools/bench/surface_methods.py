@@ -233,9 +233,10 @@ def surface_methods(moving: bool = False) -> tuple[Method, ...]:
     """Methods of the closest surface point, for still or for moving vertices."""
     wrap = _moving if moving else _query
     small = 40_000
+    slow = Method("monopart torch (reference)", wrap(OursPlain), ours=True, largest=1024)
     return (
         Method("monopart", wrap(Ours), ours=True),
-        Method("monopart torch (reference)", wrap(OursPlain), ours=True, largest=1024),
+        *(() if moving else (slow,)),
         Method("Warp, plain query", wrap(WarpPlain), ("warp",), "pip install warp-lang"),
         Method("Open3D", wrap(Open3D), ("open3d",), "pip install open3d"),
         Method("libigl (float64)", wrap(Libigl), ("igl",), "pip install libigl"),

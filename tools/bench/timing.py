@@ -84,7 +84,7 @@ def measure(
 ) -> tuple[dict[str, Timing], dict[str, Any]]:
     """Time several calls in turn, so that a disturbance of the machine hits all of them.
 
-    Each is run once untimed; then, round by round, each once, from another first one every round.
+    The first round is not timed, unless there is but one; each round begins with another call.
 
     Args:
         calls: what to time, by name.
@@ -93,12 +93,14 @@ def measure(
     Returns:
         The timings and the last result of each call.
     """
-    results = {name: call() for name, call in calls.items()}
+    warm = effort.rounds > 1
+    results = {name: call() for name, call in calls.items()} if warm else {}
     walls: dict[str, list[float]] = {name: [] for name in calls}
     cpus: dict[str, list[float]] = {name: [] for name in calls}
     names = list(calls)
     collecting = gc.isenabled()
-    gc.collect()
+    if warm:
+        gc.collect()
     gc.disable()
     try:
         for turn in range(effort.rounds):

@@ -34,18 +34,20 @@ def _needs(parameter: str | None = None) -> Callable[[], str | None]:
 def _method(name: str, **options: Any) -> Callable[[Any], Callable[[], Any]]:
     def prepare(data: SurfaceData) -> Callable[[], Any]:
         solve = load(_MODULE).inverse_skin
-        return lambda: solve(data.points, data.posed, data.body, method=name, **options)
+        given = {"method": name, "rest_verts": data.rest} | options
+        return lambda: solve(data.points, data.posed, data.body, **given)
 
     return prepare
 
 
 def unskin_methods() -> tuple[Method, ...]:
-    """The methods; the first one is what ratios refer to."""
+    """The methods, the classical ones in batched torch; ratios refer to the first one."""
     one, many = _needs(), _needs("starts")
     return (
-        Method("newton", _method("newton"), ours=True, needs=one),
+        Method("newton (default)", _method("newton"), ours=True, needs=one),
+        Method("newton, 1 start", _method("newton", starts=1), ours=True, needs=many),
         Method("newton, 3 starts", _method("newton", starts=3), ours=True, needs=many),
-        Method("broyden, 1 start", _method("broyden"), needs=one),
+        Method("broyden, 1 start", _method("broyden", starts=1), needs=many),
         Method(f"broyden, {STARTS} starts", _method("broyden", starts=STARTS), needs=many),
         Method("fixed point", _method("fixed_point"), needs=one),
         Method("closest surface", _method("surface"), needs=one),
