@@ -6,6 +6,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 FOLDERS := geometry fields toolkit tools
 SOURCES := $(shell find $(FOLDERS) -type f ! -name '*.pyc') README.md LICENSE
 DEMO := runs/demo
+# threads that wait at a barrier sleep: on a busy machine spinning ones starve those that work
+export OMP_WAIT_POLICY ?= PASSIVE
 
 .PHONY: help install demo test lint docs snapshots clean
 .DELETE_ON_ERROR:

@@ -104,7 +104,7 @@ def _rows(
             continue
         calls[method.name], used[method.name] = call, method
     effort = problem.effort if problem.effort and not settings.quick else settings.effort
-    timings, results = measure(calls, effort)
+    timings, results = measure(calls, effort, warm=True)
     rows = []
     for name, timing in timings.items():
         read = used[name].read

@@ -80,26 +80,26 @@ def timed(call: Callable[[], Any]) -> tuple[float, float, Any]:
 
 
 def measure(
-    calls: Mapping[str, Callable[[], Any]], effort: Effort
+    calls: Mapping[str, Callable[[], Any]], effort: Effort, warm: bool = False
 ) -> tuple[dict[str, Timing], dict[str, Any]]:
     """Time several calls in turn, so that a disturbance of the machine hits all of them.
 
-    The first round is not timed, unless there is but one; each round begins with another call.
+    Each round begins with another call.
 
     Args:
         calls: what to time, by name.
         effort: how often.
+        warm: every call has run before; otherwise each is run once untimed.
 
     Returns:
         The timings and the last result of each call.
     """
-    warm = effort.rounds > 1
-    results = {name: call() for name, call in calls.items()} if warm else {}
+    results = {} if warm else {name: call() for name, call in calls.items()}
     walls: dict[str, list[float]] = {name: [] for name in calls}
     cpus: dict[str, list[float]] = {name: [] for name in calls}
     names = list(calls)
     collecting = gc.isenabled()
-    if warm:
+    if effort.rounds > 1:
         gc.collect()
     gc.disable()
     try:
