@@ -43,7 +43,15 @@ class FieldPoint:
 def vertex_maps(
     transforms: Float[Tensor, "J 4 4"], weights: Float[Tensor, "V J"]
 ) -> Float[Tensor, "V 3 4"]:
-    """Blended 3x4 maps of the vertices; on a face they mix by barycentrics, exactly."""
+    """Blended 3x4 maps of the vertices.
+
+    Args:
+        transforms: joint transforms, rest to posed.
+        weights: skinning weights of the vertices.
+
+    Returns:
+        The maps; that of a point on a face is their barycentric mix, exactly. Differentiable.
+    """
     return (weights @ transforms[:, :3, :].flatten(1)).unflatten(-1, (3, 4))
 
 
@@ -54,7 +62,18 @@ def field_at(
     faces: Int[Tensor, "F 3"],
     maps: Float[Tensor, "V 3 4"],
 ) -> FieldPoint:
-    """The forward field where the closest face is known; differentiable in all but the indices."""
+    """The forward field where the closest face is known.
+
+    Args:
+        points: rest-space points, metres.
+        face: closest rest face of each.
+        rest: rest vertices, metres.
+        faces: vertex indices of the rest surface.
+        maps: from `vertex_maps`.
+
+    Returns:
+        The field; differentiable in points, rest vertices and maps.
+    """
     corners = faces[face]
     triangles = rest[corners]
     bary = closest_on_triangle(points, triangles)
@@ -94,7 +113,14 @@ def _bary_gradients(bary: Tensor, triangles: Tensor) -> Tensor:
 
 
 def field_jacobian(at: FieldPoint) -> Float[Tensor, "n 3 3"]:
-    """The Jacobian of the forward field: A(w) + sum over corners of (A_c p) (grad b_c)^T."""
+    """The Jacobian of the forward field in the rest points, analytic.
+
+    Args:
+        at: the field at the points.
+
+    Returns:
+        A(w) + sum over corners of (A_c p) (grad b_c)^T, of the face, edge or corner that is closest.
+    """
     gradients = _bary_gradients(at.bary, at.triangles)
     return at.linear + (at.corner_images[..., :, None] * gradients[..., None, :]).sum(1)
 
@@ -106,8 +132,8 @@ class SkinningField:
 
     >>> body = BodyModel.default()
     >>> field = SkinningField(body)
-    >>> field.weights_at(body.v_template[:5]).sum(-1)
-    tensor([1.0000, 1.0000, 1.0000, 1.0000, 1.0000])
+    >>> torch.allclose(field.weights_at(body.v_template), body.weights, atol=1e-5)
+    True
     """
 
     def __init__(
@@ -172,7 +198,14 @@ class SkinningField:
 
 
 def mesh_id(index: SurfaceIndex) -> Any:
-    """Warp's handle of the mesh of an index with the warp back end."""
+    """Warp's handle of the mesh of an index.
+
+    Args:
+        index: with the warp back end.
+
+    Returns:
+        A launch argument.
+    """
     return index._mesh.id  # type: ignore[union-attr]
 
 

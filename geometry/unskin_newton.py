@@ -86,8 +86,15 @@ def guess_warp(
 ) -> Float[Tensor, "n 3"]:
     """First guesses: the inverse map of the posed vertex that the voxel of a point names.
 
-    Where the voxel is empty it is a corner of the closest posed face within twice ``max_distance``,
-    beyond that the point itself.
+    Args:
+        field: the forward field, with the warp back end.
+        points: float32 targets in pose space, metres.
+        maps: blended maps of the vertices.
+        max_distance: half the reach of the search that follows an empty voxel, metres.
+
+    Returns:
+        Rest points; where the voxel is empty, by a corner of the closest posed face, and where that
+        is out of reach too, the point itself.
     """
     from .kernels.launch import launch, launch_one, view
     from .kernels.newton import EMPTY, first_guess, splat_verts
@@ -166,7 +173,19 @@ def newton_torch(
     plan: Plan,
     guess: Float[Tensor, "n 3"],
 ) -> Roots:
-    """The plain twin of :func:`newton_warp`, in the dtype of the input."""
+    """The plain twin of :func:`newton_warp`, in the dtype of the input.
+
+    Args:
+        field: the forward field.
+        points: targets in pose space, finite.
+        maps: blended maps of the vertices.
+        bones: for the starts after the first.
+        plan: how to search.
+        guess: first rest points.
+
+    Returns:
+        The roots.
+    """
     best = nowhere(guess)
     for start in range(min(plan.starts, bones.joints.shape[0] + 1)):
         todo = (best.residual > ARRIVED).nonzero().squeeze(-1)
@@ -204,7 +223,14 @@ def _descend(
 
 
 def nowhere(guess: Float[Tensor, "n 3"]) -> Roots:
-    """Roots that anything is better than."""
+    """Roots that anything is better than.
+
+    Args:
+        guess: where they are.
+
+    Returns:
+        Roots of infinite residual.
+    """
     face = torch.zeros(len(guess), dtype=torch.long, device=guess.device)
     residual = torch.full((len(guess),), math.inf, dtype=guess.dtype, device=guess.device)
     return Roots(guess.clone(), face, residual, torch.zeros_like(face, dtype=torch.bool))
@@ -222,7 +248,15 @@ def _spread(found: Roots, rows: Tensor, old: Roots) -> Roots:
 
 
 def keep_better(old: Roots, new: Roots) -> Roots:
-    """Per point the one with the smaller residual; the old one where both are equal."""
+    """Per point the better of two roots.
+
+    Args:
+        old: taken where both are equal.
+        new: taken where its residual is smaller.
+
+    Returns:
+        The roots.
+    """
     take = new.residual < old.residual
     return Roots(
         torch.where(take[:, None], new.points, old.points),

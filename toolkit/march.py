@@ -11,7 +11,7 @@ from monopart.fields.volume import composite
 from monopart.geometry.cameras import Rays
 from monopart.geometry.posed_parts import PosedParts
 
-from .model import AvatarModel, FrameInput
+from .model import AvatarModel, FrameInput, distance
 
 SPENT = 5e-5  # light left below which a ray stops: the largest change of a colour
 ROUNDS = (0, 7, 11, 15, 20, 28, 40, 1 << 30)  # samples of a ray after which the light is checked
@@ -66,7 +66,7 @@ def march(
         delta = torch.full_like(part.depth, step)
         out = composite(shaded.sigma, shaded.color, delta, part.ray_start, part.depth)
         color += light[:, None] * out.color
-        depth += light * out.depth
+        depth += light * distance(out)
         light *= 1.0 - out.opacity
         stats.update(shaded.counts)
     return Marched(color, 1.0 - light, depth, stats)

@@ -11,7 +11,7 @@ from monopart.fields.occupancy import PartOccupancy, visible_samples
 from monopart.fields.part_field import PartField, PartFieldSpec
 from monopart.fields.part_union import union_by_density
 from monopart.fields.residual import UVT_GRID, ResidualField
-from monopart.fields.volume import composite
+from monopart.fields.volume import Composite, composite
 from monopart.geometry.body import BodyModel, PosedBody
 from monopart.geometry.cameras import Rays
 from monopart.geometry.culling import ShellSamples
@@ -237,7 +237,12 @@ class AvatarModel(torch.nn.Module):
             "samples_shell": len(samples.depth),
             **shaded.counts,
         }
-        return Rendered(out.color, out.opacity, out.depth, stats, samples, shaded)
+        return Rendered(out.color, out.opacity, distance(out), stats, samples, shaded)
+
+
+def distance(out: Composite) -> Tensor:
+    """Expected distance of rays that were composited with the depth of their samples."""
+    return torch.zeros_like(out.opacity) if out.depth is None else out.depth
 
 
 def part_boxes(

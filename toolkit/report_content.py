@@ -189,7 +189,7 @@ def triples(avatar: Avatar, evaluation: Evaluation, splits: int) -> list[Triple]
     """
     record, shown = avatar.record, []
     for image, is_worst in chosen_images(evaluation.images, max(1, TRIPLES // splits)):
-        label = f"camera {record.camera_names[image.camera]}, frame {image.frame}"
+        label = f"{record.camera_names[image.camera]}, frame {image.frame}"
         shown.append(
             Triple(
                 f"{label} (worst of split)" if is_worst else label,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from monopart.geometry.cameras import Rays
 from monopart.geometry.errors import MonopartError
@@ -224,7 +225,7 @@ class Trainer:
             return
         decay = min(decay**4, (1 + step) / (10 + step))
         current = [p.detach() for p in self.avatar.model.parameters()]
-        torch._foreach_lerp_(self.average, current, 1.0 - decay)
+        get_ema_multi_avg_fn(decay)(self.average, current, 0)
 
     def loop(self, progress: Progress | None = None) -> TrainResult:
         """Train to the end of the budget, then put the moving average into the model.

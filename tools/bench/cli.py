@@ -35,6 +35,8 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument("--seconds", type=float, default=240.0, metavar="S")
         elif name == "render":
             command.add_argument("run", type=Path, metavar="RUN")
+        if name == "geometry":
+            command.add_argument("--poses", type=int, default=20, metavar="N")
         if name in ("geometry", "render"):
             command.add_argument("--capture", type=Path, metavar="DIR")
         command.add_argument("--only", action="append", default=[], metavar="OPERATION")
@@ -106,6 +108,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         capture=getattr(arguments, "capture", None),
         run=getattr(arguments, "run", None),
         only=tuple(arguments.only),
+        poses=max(1, getattr(arguments, "poses", 20)),
         presets=tuple(getattr(arguments, "preset", ())),
         seconds=getattr(arguments, "seconds", 240.0),
     )

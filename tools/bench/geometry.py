@@ -33,7 +33,7 @@ MANY = Effort(rounds=5, least=2, seconds=1.0)
 def _near_surface(settings: Settings) -> Iterator[Problem]:
     """All poses at one size, then all sizes at a pose half-way."""
     body = BodyModel.default()
-    poses = pose_list(body, 2 if settings.quick else 20, settings.capture)
+    poses = pose_list(body, 2 if settings.quick else settings.poses, settings.capture)
     count = 32 if settings.quick else POINTS
     for seed, (name, pose) in enumerate(poses):
         yield Problem(count, name, surface_data(body, pose, count, seed), MANY)
@@ -53,7 +53,7 @@ def _one_size(settings: Settings) -> Iterator[Problem]:
 
 def _poses_only(settings: Settings) -> Iterator[Problem]:
     body = BodyModel.default()
-    poses = pose_list(body, 2 if settings.quick else 20, settings.capture)
+    poses = pose_list(body, 2 if settings.quick else settings.poses, settings.capture)
     count = 32 if settings.quick else POINTS
     for seed, (name, pose) in enumerate(poses):
         yield Problem(count, name, surface_data(body, pose, count, seed), MANY)

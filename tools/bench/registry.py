@@ -24,6 +24,8 @@ class Settings:
     """Names of the operations to run; empty for all."""
     presets: tuple[str, ...] = ()
     """Presets to train; empty for all."""
+    poses: int = 20
+    """Poses on which geometry is measured."""
     seconds: float = 240.0
     """Wall-clock budget of each training, seconds."""
 

@@ -100,6 +100,8 @@ class Summary:
     """Largest error of all settings."""
     ratio: float | None
     """Median over the settings of wall-clock seconds relative to our first method."""
+    cpu_ratio: float | None
+    """The same of the CPU seconds."""
     facts: dict[str, float]
     """Other figures, mean over the settings."""
 
@@ -154,16 +156,16 @@ def _median(values: list[float]) -> float:
 def summarise(table: Table) -> list[Summary]:
     """Methods of a table by size, over all settings, in the order of size and time."""
     ours = next((r.method for r in table.rows if r.ours), None)
-    base = {(r.size, r.setting): r.wall.median for r in table.rows if r.method == ours}
+    base = {(r.size, r.setting): r for r in table.rows if r.method == ours}
     groups: dict[tuple[int, str], list[Row]] = {}
     for row in table.rows:
         groups.setdefault((row.size, row.method), []).append(row)
     result = []
     for (size, method), rows in groups.items():
         errors = [r.error for r in rows if r.error is not None]
-        ratios = [
-            r.wall.median / base[r.size, r.setting] for r in rows if (r.size, r.setting) in base
-        ]
+        pairs = [(r, base[r.size, r.setting]) for r in rows if (r.size, r.setting) in base]
+        ratios = [r.wall.median / max(b.wall.median, 1e-12) for r, b in pairs]
+        cpu_ratios = [r.cpu.median / max(b.cpu.median, 1e-12) for r, b in pairs]
         names = {name for r in rows for name in r.facts}
         means = {n: [r.facts[n] for r in rows if n in r.facts] for n in sorted(names)}
         result.append(
@@ -177,6 +179,7 @@ def summarise(table: Table) -> list[Summary]:
                 _median([r.cpu.median for r in rows]),
                 max(errors) if errors else None,
                 _median(ratios) if ratios else None,
+                _median(cpu_ratios) if cpu_ratios else None,
                 {n: sum(v) / len(v) for n, v in means.items()},
             )
         )

@@ -25,6 +25,10 @@ def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:.2g}"
 
 
+def _ratio(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
 def _facts(facts: dict[str, float]) -> str:
     return ", ".join(f"{name} {value:.4g}" for name, value in facts.items())
 
@@ -38,13 +42,14 @@ def cells(summary: Summary) -> list[str]:
         seconds(summary.low),
         seconds(summary.iqr),
         seconds(summary.cpu),
-        "–" if summary.ratio is None else f"{summary.ratio:.2f}",
+        _ratio(summary.ratio),
+        _ratio(summary.cpu_ratio),
         _number(summary.error),
         _facts(summary.facts),
     ]
 
 
-HEAD = ["size", "method", "median", "min", "IQR", "CPU", "× ours", "error", "also"]
+HEAD = ["size", "method", "median", "min", "IQR", "CPU", "× ours", "CPU × ours", "error", "also"]
 
 
 def print_report(report: Report) -> None:
