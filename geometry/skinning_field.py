@@ -119,7 +119,7 @@ def field_jacobian(at: FieldPoint) -> Float[Tensor, "n 3 3"]:
         at: the field at the points.
 
     Returns:
-        A(w) + sum over corners of (A_c p) (grad b_c)^T, of the face, edge or corner that is closest.
+        A(w) + sum over corners of (A_c p) (grad b_c)^T, on the closest face, edge or corner.
     """
     gradients = _bary_gradients(at.bary, at.triangles)
     return at.linear + (at.corner_images[..., :, None] * gradients[..., None, :]).sum(1)
