@@ -148,7 +148,7 @@ def _references(data: ReportData) -> str:
         entries: list[tuple[str, str, Mapping[str, Number | None], Number | None, str]] = []
         if ours is not None:
             took = data.timings.stages.get("training")
-            entries.append(("This run", ' class="ours"', ours, took, ""))
+            entries.append(("This run", ' class="ours"', ours, took, "wall-clock seconds"))
         for r in data.references:
             if (r.split, r.protocol, r.region) == (split, protocol, region):
                 scores = {"psnr": r.psnr, "ssim": r.ssim, "lpips": r.lpips}
@@ -224,8 +224,8 @@ def skipping_section(rows: Sequence[SkipRow]) -> str:
             f'<td class="note">{escape(row.note)}</td></tr>'
         )
     head = [("Work", False), ("Dense", True), ("Evaluated", True), ("Share", True)]
-    table = _table([*head, ("", False), ("Why the image stays the same", False)], out)
-    lead = "Exact skipping: work that cannot change the image is not done."
+    table = _table([*head, ("", False), ("Why", False)], out)
+    lead = "Work that is not done. A row is exact, or says that it is approximate and where."
     return section("skipped", "What was skipped", lead, table)
 
 

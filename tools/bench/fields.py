@@ -66,26 +66,22 @@ class _Volume:
     """Compositing of packed samples; differentiated in the density."""
 
     ray_start: Tensor
+    index: tuple[Tensor, Tensor]
+    """Row and column of every sample in a padded table."""
+    longest: int
+    """Samples of the longest ray."""
 
     def __call__(self, backend: Any, sigma: Tensor, color: Tensor, delta: Tensor) -> Tensor:
         if backend == "dense":
             return self._dense(sigma, color, delta)
         return composite(sigma, color, delta, self.ray_start, backend=backend).color
 
-    @cached_property
-    def _layout(self) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        """Row and column of every sample in a padded table, and its shape; not timed."""
-        counts = self.ray_start.diff()
-        ray = torch.repeat_interleave(torch.arange(len(counts)), counts)
-        column = torch.arange(len(ray)) - self.ray_start[ray]
-        return (ray, column), (len(counts), int(counts.max()))
-
     def _dense(self, sigma: Tensor, color: Tensor, delta: Tensor) -> Tensor:
         """Padded, without a check that would break a compiled graph."""
-        index, shape = self._layout
+        shape = (len(self.ray_start) - 1, self.longest)
 
         def pad(values: Tensor) -> Tensor:
-            return values.new_zeros(*shape, *values.shape[1:]).index_put(index, values)
+            return values.new_zeros(*shape, *values.shape[1:]).index_put(self.index, values)
 
         return composite_dense(pad(sigma), pad(color), pad(delta)).color
 
@@ -218,11 +214,14 @@ def _volumes(settings: Settings, backward: bool) -> Iterator[Problem]:
         start = torch.zeros(rays + 1, dtype=torch.int64)
         torch.cumsum(counts, 0, out=start[1:])
         total = int(start[-1])
+        ray = torch.repeat_interleave(torch.arange(rays), counts)
+        index = (ray, torch.arange(total) - start[ray])
+        volume = _Volume(start, index, int(counts.max()))
         sigma = 40 * torch.rand(total, generator=generator)
         color = torch.rand(total, 3, generator=generator)
         sigma.requires_grad_(backward)
         tensors = (sigma, color, torch.full((total,), 0.0125))
-        yield Problem(rays, "0–39 samples a ray", Case(_Volume(start), tensors, sigma, backward))
+        yield Problem(rays, "0–39 samples a ray", Case(volume, tensors, sigma, backward))
 
 
 def _networks(settings: Settings, backward: bool) -> Iterator[Problem]:
