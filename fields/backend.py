@@ -14,7 +14,11 @@ Backend = Literal["auto", "warp", "torch"]
 
 @functools.cache
 def warp_is_installed() -> bool:
-    """Tell whether Warp can be imported, without importing it."""
+    """Tell whether Warp can be imported, without importing it.
+
+    Returns:
+        True where ``import warp`` would find a package.
+    """
     return importlib.util.find_spec("warp") is not None
 
 

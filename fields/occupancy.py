@@ -51,7 +51,15 @@ class PartOccupancy(torch.nn.Module):
         self.register_buffer("floor", torch.zeros(len(lo) * cells**3))
 
     def cells_of(self, points: Float[Tensor, "n 3"], part: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
-        """Flat index of the cell of each canonical point (metres) in the grid of its part."""
+        """Flat index of the cell of each canonical point in the grid of its part.
+
+        Args:
+            points: canonical points, metres.
+            part: part of each point.
+
+        Returns:
+            Indices into ``peak`` and ``floor``; points outside belong to the nearest border cell.
+        """
         place = (points - self.lo[part]) * (self.cells / self.edge)[part, None]
         x, y, z = place.long().clamp_(0, self.cells - 1).unbind(-1)
         return ((part * self.cells + z) * self.cells + y) * self.cells + x
@@ -62,6 +70,9 @@ class PartOccupancy(torch.nn.Module):
         Args:
             cell: from :meth:`cells_of`.
             density: 1/m.
+
+        Returns:
+            False only where training has seen less than this density.
         """
         return self.peak[cell] > density
 
@@ -92,6 +103,9 @@ def visible_samples(
         ray_start: first sample of each ray, and the end.
         ray: ray of each sample.
         limit: optical depth beyond which nothing is seen; 10 leaves 5e-5 of the light.
+
+    Returns:
+        [N] True for the samples that light reaches.
 
     >>> wall, ray = torch.tensor([6.0, 6.0, 6.0, 1.0]), torch.tensor([0, 0, 0, 1])
     >>> visible_samples(wall, torch.tensor([0, 3, 4]), ray, 10.0).tolist()

@@ -229,10 +229,9 @@ def _build_lists(field: SkinningField) -> dict[str, Any]:
     cells = near.nonzero().squeeze(-1)
     slots = torch.full((count,), -1, dtype=torch.int32, device=rest.device)
     slots[cells] = torch.arange(len(cells), dtype=torch.int32, device=rest.device)
-    face = torch.full((len(cells), _LISTED), -1, dtype=torch.int32, device=rest.device)
-    gap = torch.zeros(len(cells), _LISTED, device=rest.device)
+    entries = torch.full((len(cells), _LISTED, 2), -1.0, device=rest.device)
     cells = cells.int()
-    args = [mesh, view(tris, 3), view(cells), lo, dims, voxel, view(face), view(gap)]
+    args = [mesh, view(tris, 3), view(cells), lo, dims, voxel, view(entries, 2)]
     launch(list_faces, len(cells), args, rest)
     return {
         "tris": tris,
@@ -243,8 +242,7 @@ def _build_lists(field: SkinningField) -> dict[str, Any]:
         "dims": dims,
         "voxel": voxel,
         "slots": slots,
-        "face": face,
-        "gap": gap,
+        "near": entries,
     }
 
 

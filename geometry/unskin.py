@@ -218,7 +218,7 @@ def _iterative(
             guess = _surface_guess(x, posed, field)
             roots = _search(method, field, x, still, bones, plan, guess)
             weights = _weights(field, roots.points, roots.face, field.rest)
-        weights = weights * roots.residual.isfinite()[:, None]
+            weights = weights * roots.residual.isfinite()[:, None]
         valid = roots.invertible & (roots.residual <= ARRIVED)
     wanted = points.requires_grad or maps.requires_grad or rest.requires_grad
     if not (torch.is_grad_enabled() and wanted):

@@ -120,6 +120,14 @@ def guess_warp(
     return guess
 
 
+def _by_voxel(points: Tensor, lo: tuple, dims: tuple, voxel: float) -> Tensor:
+    """Order in which neighbours follow each other: the look-ups then hit warm memory."""
+    corner = torch.tensor(lo, dtype=points.dtype, device=points.device)
+    limit = torch.tensor(dims, dtype=torch.int32, device=points.device)
+    cell = ((points - corner) / voxel).clamp(0, 1e6).int().minimum(limit - 1)
+    return ((cell[:, 2] * limit[1] + cell[:, 1]) * limit[0] + cell[:, 0]).argsort()
+
+
 def newton_warp(
     field: SkinningField,
     points: Float[Tensor, "n 3"],
@@ -154,9 +162,16 @@ def newton_warp(
     residual = torch.zeros(count, device=device)
     invertible = torch.zeros(count, dtype=torch.bool, device=device)
     limits = (plan.stop, ARRIVED, MIN_DET, min(plan.max_distance, 1e10))
-    args = [view(points, 3), view(guess, 3), mesh_id(field.index), view(lists["tris"], 3)]
+    order = _by_voxel(guess, lists["lo"], lists["dims"], lists["voxel"])
+    args = [
+        view(order),
+        view(points, 3),
+        view(guess, 3),
+        mesh_id(field.index),
+        view(lists["tris"], 3),
+    ]
     args += [view(lists["discs"], 4), view(lists["faces"], 3), lists["lo"], lists["dims"]]
-    args += [lists["voxel"], view(lists["slots"]), view(lists["face"]), view(lists["gap"])]
+    args += [lists["voxel"], view(lists["slots"]), view(lists["near"], 2)]
     args += [view(maps, 4), view(lists["weights"]), view(bones.joints, 3), view(bones.inverses, 4)]
     args += [plan.starts, plan.iterations, int(plan.gradients), limits]
     out = [view(rest, 3), view(weights), view(face), view(residual), view(invertible)]

@@ -64,7 +64,7 @@ def report_data(run: Path, avatar: Avatar, results: RunResults) -> ReportData:
         f"{training.iterations} iterations. Medians per iteration and per frame.",
     )
     return ReportData(
-        title=f"{record.name}: {run.name}",
+        title=record.name if run.name == record.name else f"{record.name}: {run.name}",
         capture=capture_facts(describe(record)),
         headline=headline(results, timings),
         curves=curves,

@@ -102,12 +102,12 @@ def list_faces(
     lo: wp.vec3,
     dims: wp.vec3i,
     voxel: float,
-    face: wp.array2d(dtype=wp.int32),
-    gap: wp.array2d(dtype=wp.float32),
+    near: wp.array2d(dtype=wp.vec2),
 ):
     """The faces that can be the closest of any point of a voxel, nearest to its centre first.
 
-    A row that is not full is complete and ends with -1; a full row holds the nearest ones.
+    An entry is (distance to the centre, face): side by side, for the look-up waits for memory.
+    A row that is not full is complete and ends with face -1; a full row holds the nearest ones.
     """
     i = start + wp.tid()
     c = centre_of(cells[i], lo, dims, voxel)
@@ -117,17 +117,15 @@ def list_faces(
     boxes = wp.mesh_query_aabb(mesh, c - side, c + side)
     f = int(0)
     count = int(0)
-    size = face.shape[1]
+    size = near.shape[1]
     while wp.mesh_query_aabb_next(boxes, f):
         d = gap_to_face(c, tris, f)
-        if d <= limit and (count < size or d < gap[i, size - 1]):
+        if d <= limit and (count < size or d < near[i, size - 1][0]):
             k = wp.min(count, size - 1)
-            while k > 0 and gap[i, wp.max(k - 1, 0)] > d:
-                gap[i, k] = gap[i, k - 1]
-                face[i, k] = face[i, k - 1]
+            while k > 0 and near[i, wp.max(k - 1, 0)][0] > d:
+                near[i, k] = near[i, k - 1]
                 k -= 1
-            gap[i, k] = d
-            face[i, k] = f
+            near[i, k] = wp.vec2(d, float(f))
             count += 1
 
 
@@ -157,8 +155,7 @@ def closest_face(
     dims: wp.vec3i,
     voxel: float,
     slots: wp.array(dtype=wp.int32),
-    near_face: wp.array2d(dtype=wp.int32),
-    near_gap: wp.array2d(dtype=wp.float32),
+    near: wp.array2d(dtype=wp.vec2),
     hint: int,
     max_distance: float,
 ):
@@ -177,11 +174,12 @@ def closest_face(
         slot = slots[cell]
     if slot >= 0:
         away = wp.length(p - centre_of(cell, lo, dims, voxel)) + 1.0e-6
-        size = near_face.shape[1]
+        size = near.shape[1]
         k = int(0)
         while k < size and not proven:
-            f = near_face[slot, k]
-            if f < 0 or near_gap[slot, k] - away > best_gap:
+            entry = near[slot, k]
+            f = int(entry[1])
+            if f < 0 or entry[0] - away > best_gap:
                 proven = True
             elif not out_of_reach(p, discs, f, best_gap):
                 d = gap_to_face(p, tris, f)

@@ -165,6 +165,7 @@ def bone_guess(
 @wp.kernel
 def solve(
     start: int,
+    order: wp.array(dtype=wp.int64),
     points: wp.array(dtype=wp.vec3),
     guess: wp.array(dtype=wp.vec3),
     mesh: wp.uint64,
@@ -175,8 +176,7 @@ def solve(
     dims: wp.vec3i,
     voxel: float,
     slots: wp.array(dtype=wp.int32),
-    near_face: wp.array2d(dtype=wp.int32),
-    near_gap: wp.array2d(dtype=wp.float32),
+    near: wp.array2d(dtype=wp.vec2),
     maps: wp.array2d(dtype=wp.vec4),
     weights: wp.array2d(dtype=wp.float32),
     joints: wp.array(dtype=wp.vec3),
@@ -197,7 +197,7 @@ def solve(
     again from the inverse of its nearest bones. ``limits``: residual that ends the iterations,
     residual that ends the starts, smallest determinant, reach of the rest surface.
     """
-    i = start + wp.tid()
+    i = int(order[start + wp.tid()])
     x = points[i]
     p = guess[i]
     best_p = p
@@ -210,9 +210,7 @@ def solve(
     k = int(0)
     attempt = int(0)
     while attempt < starts:
-        f = closest_face(
-            p, mesh, tris, discs, lo, dims, voxel, slots, near_face, near_gap, f, limits[3]
-        )
+        f = closest_face(p, mesh, tris, discs, lo, dims, voxel, slots, near, f, limits[3])
         over = k >= iterations or f < 0
         k += 1
         if f >= 0:
