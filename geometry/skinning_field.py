@@ -18,7 +18,7 @@ from .errors import InputError
 from .surface import SurfaceIndex, closest_on_triangle
 
 # lists of the possible closest faces near the rest surface: metres, metres, faces per voxel
-_VOXEL, _REACH, _LISTED = 0.0125, 0.06, 48
+_VOXEL, _REACH, _LISTED = 0.015, 0.06, 64
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,8 @@ class Train:
     """Held-out images to evaluate per split, evenly spread."""
     explain: bool = False
     """Print a table of the rays, samples, part evaluations and modules that were skipped."""
+    resume: bool = False
+    """Go on with the unfinished run in --out, with its own configuration."""
 
     def run(self) -> None:
         """Do it."""
@@ -85,6 +87,7 @@ class Train:
             params=self.params,
             images=self.images,
             explain=self.explain,
+            resume=self.resume,
         )
 
 

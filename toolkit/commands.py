@@ -22,7 +22,8 @@ from .explain import print_skipping, why_empty
 from .progress import counted, progress_bar
 from .render import Picture, render_view, render_views
 from .results import evaluate_splits, held_out, say, skipping, summary, write_results, write_scores
-from .runs import check_free, create_run, next_free, open_run, read_facts
+from .resume import load_state
+from .runs import check_free, create_run, next_free, open_run, read_facts, resumable
 from .train import Trainer, TrainResult
 from .video import save_png, write_video
 
@@ -54,6 +55,7 @@ def train(
     params: str | None = None,
     images: int | None = None,
     explain: bool = False,
+    resume: bool = False,
 ) -> Path:
     """Train on a capture, evaluate, write the report; the scores and its path go to stdout.
 
@@ -66,6 +68,7 @@ def train(
         params: name of the folder of body poses, None for the capture's own.
         images: held-out images to evaluate per split; None for all.
         explain: print the table of what was skipped.
+        resume: go on with an unfinished run in ``out``, with its own configuration.
 
     Returns:
         The report.
@@ -118,17 +121,28 @@ def demo(capture: Path, out: Path, config: Config) -> Path:
 
 
 def _trained(
-    capture: Path, out: Path, config: Config, params: str | None, stages: Stages
+    capture: Path,
+    out: Path,
+    config: Config,
+    params: str | None,
+    stages: Stages,
+    resume: bool = False,
 ) -> tuple[Avatar, TrainResult, bool]:
-    """The avatar of a new run, what its training did, and whether that was interrupted."""
-    check_free(out)
-    with stages.timed("reading and body geometry"):
+    """The avatar of a run, what its training did, and whether that was interrupted."""
+    if resume:
+        config, params = resumable(out)
+    else:
+        check_free(out)
+    with stages.timed("reading and body geometry"), progress_bar("Reading") as update:
         record = read_capture(capture, params=params)
         check_capture(record, deep=True)
-        run = create_run(out, config, record)
+        run = out if resume else create_run(out, config, record)
         torch.manual_seed(config.seed)
         avatar = Avatar.create(record, config)
-        trainer = Trainer(avatar, run)
+        trainer = Trainer(avatar, run, counted(update))
+        if resume:
+            load_state(trainer, run)
+            say(f"going on from step {trainer.result.iterations}")
     with stages.timed("kernels (compiled once per machine)"):
         trainer.warm_up()
     say(f"{record.name}: training preset {config.preset} on {len(trainer.cameras)} images")

@@ -45,6 +45,21 @@ def next_free(out: Path) -> Path:
     return path
 
 
+def resumable(run: Path) -> tuple[Config, str | None]:
+    """Configuration and body track of a run that is to go on.
+
+    Raises:
+        InputError: the folder is not a run.
+    """
+    if not (run / "config.json").is_file():
+        raise InputError(
+            f"--resume: expected the folder of an unfinished run at {run}, found no config.json; "
+            "name the folder given to --out when it began"
+        )
+    config = from_json(run / "config.json")
+    return config, read_facts(run / "capture.json").get("params")
+
+
 def read_facts(path: Path) -> dict[str, Any]:
     """The JSON object of a file of a run folder.
 

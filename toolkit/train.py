@@ -22,6 +22,7 @@ from .config import Config
 from .losses import color_loss, consistency_term, offset_loss, round_trip_distance
 from .lpips import LPIPS, load_lpips
 from .model import Rendered
+from .resume import forget_state, save_state
 
 MAX_BAD_STEPS = 20  # non-finite losses in a row after which a run ends
 PRUNE = 2e-3  # absorption of a step below which a canonical cell counts as empty in training
@@ -52,17 +53,23 @@ class TrainResult:
 class Trainer:
     """Trains an avatar in place."""
 
-    def __init__(self, avatar: Avatar, run: Path | None = None) -> None:
+    def __init__(
+        self,
+        avatar: Avatar,
+        run: Path | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
         """Read the images and pose the bodies, once.
 
         Args:
             avatar: the avatar to train.
             run: folder for train.jsonl and checkpoints; None writes nothing.
+            progress: called with (done, total) as images are read.
         """
         self.avatar, self.run_folder = avatar, run
         self.config = avatar.config
         train = avatar.record.split("train")
-        images, masks = avatar.record.stack("train")
+        images, masks = avatar.record.stack("train", progress)
         self.sampler = PixelSampler(images, masks, self.config.train.band)
         self.scene = avatar.scene(train.frames)
         self.body_of_image = torch.tensor([train.frames.index(f) for _, f in train.pairs()])
@@ -234,9 +241,11 @@ class Trainer:
             progress: called with the finished part and the current numbers.
         """
         config, result = self.config.train, self.result
-        start, cpu = time.perf_counter(), time.process_time()
-        saved = start
-        step = 0
+        # A resumed run goes on with the time that it has spent already.
+        start = time.perf_counter() - result.seconds
+        cpu = time.process_time() - result.cpu_seconds
+        saved = time.perf_counter()
+        step = result.iterations
         while True:
             elapsed = time.perf_counter() - start
             done = elapsed / config.seconds if config.seconds else step / config.iterations
@@ -252,7 +261,7 @@ class Trainer:
                 if progress is not None:
                     progress(done, numbers)
             if time.perf_counter() - saved > config.checkpoint_seconds:
-                self.save()
+                self.checkpoint()
                 saved = time.perf_counter()
         self.finish()
         return result
@@ -266,6 +275,14 @@ class Trainer:
                 ):
                     value.copy_(average)
         self.avatar.model.eval()
+        self.save()
+        if self.run_folder is not None:
+            forget_state(self.run_folder)
+
+    def checkpoint(self) -> None:
+        """Write what ``--resume`` needs to go on from here, and usable weights."""
+        if self.run_folder is not None:
+            save_state(self, self.run_folder)
         self.save()
 
     def save(self) -> None:
