@@ -9,7 +9,7 @@ from .config import Config, DeformConfig, TrainConfig
 
 def _presets() -> dict[str, Config]:
     fast = Config(preset="fast")
-    tiny = Config(preset="tiny", train=TrainConfig(seconds=100.0, checkpoint_seconds=30.0))
+    tiny = Config(preset="tiny", train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0))
     rigid = Config(preset="rigid", deform=DeformConfig(residual=False))
     return {"fast": fast, "tiny": tiny, "rigid": rigid}
 

@@ -131,7 +131,10 @@ def _suite(arguments: argparse.Namespace) -> None:
         from .suite import run_suite
 
         rooms = {"geometry": geometry, "fields": fields, "render": render, "scaling": scaling}
-        report = run_suite(arguments.command, rooms[arguments.command].operations(), settings)
+        operations = rooms[arguments.command].operations()
+        report = run_suite(
+            arguments.command, operations, settings, lambda r: save_report(r, arguments.out)
+        )
         if arguments.command == "scaling":
             report = scaling.with_exponents(report)
     path = save_report(report, arguments.out)

@@ -48,10 +48,25 @@ def chosen(operations: Sequence[Operation], only: Iterable[str]) -> list[Operati
     return [o for o in operations if not only or o.name in set(only)]
 
 
-def run_suite(name: str, operations: Sequence[Operation], settings: Settings) -> Report:
-    """Run the chosen operations one after the other."""
-    tables = [run_operation(o, settings) for o in chosen(operations, settings.only)]
-    return Report(name, settings.quick, environment(), tables)
+def run_suite(
+    name: str,
+    operations: Sequence[Operation],
+    settings: Settings,
+    keep: Callable[[Report], Any] = lambda report: None,
+) -> Report:
+    """Run the chosen operations one after the other.
+
+    Args:
+        name: of the suite.
+        operations: all of them.
+        settings: what the command line asked for.
+        keep: called with the report so far after every operation, so that an interrupt loses little.
+    """
+    report = Report(name, settings.quick, environment(), [])
+    for operation in chosen(operations, settings.only):
+        report.tables.append(run_operation(operation, settings))
+        keep(report)
+    return report
 
 
 def run_operation(operation: Operation, settings: Settings) -> Table:
