@@ -78,7 +78,7 @@ def train(
         KeyboardInterrupt: the training was interrupted; everything is written.
     """
     stages = Stages()
-    avatar, result, interrupted = _trained(capture, out, config, params, stages)
+    avatar, result, interrupted = _trained(capture, out, config, params, stages, resume)
     with stages.timed("evaluation"):
         evaluations = evaluate_splits(avatar, held_out(avatar.record), images)
     size = min(STRIP_SIZE, *avatar.record.image_size)

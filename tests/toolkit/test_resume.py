@@ -10,8 +10,10 @@ from miniature import write_miniature
 from monopart.geometry.errors import InputError
 from monopart.toolkit.avatar import Avatar
 from monopart.toolkit.captures import read_capture
+from monopart.toolkit.cli import main
 from monopart.toolkit.presets import preset, with_overrides
 from monopart.toolkit.resume import STATE, load_state, save_state
+from monopart.toolkit.runs import create_run
 from monopart.toolkit.train import Trainer
 
 SMALL = with_overrides(
@@ -86,3 +88,27 @@ def test_states_that_do_not_fit_are_refused(capture: Path, tmp_path: Path) -> No
     wrong = Trainer(Avatar.create(read_capture(capture), other), run)
     with pytest.raises(InputError, match="difference"):
         load_state(wrong, run)
+
+
+def test_resume_on_the_command_line(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    asked = ["train", str(capture), "--out", str(run), "--resume"]
+    assert main(asked) == 2
+    assert "unfinished run" in capsys.readouterr().err
+    assert not run.exists()
+
+    record = read_capture(capture)
+    create_run(run, SMALL, record)
+    torch.manual_seed(SMALL.seed)
+    begun = Trainer(Avatar.create(record, SMALL), run)
+    for step in range(5):
+        begun.step(step, step / 8)
+        begun.result.iterations = step + 1
+    begun.checkpoint()
+    assert main([*asked, "--images", "1"]) is None
+    assert "going on from step 5" in capsys.readouterr().err
+    lines = (run / "train.jsonl").read_text().splitlines()
+    assert [json.loads(line)["iteration"] for line in lines] == [6, 7, 8]
+    assert (run / "report.html").is_file()

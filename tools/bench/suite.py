@@ -60,7 +60,7 @@ def run_suite(
         name: of the suite.
         operations: all of them.
         settings: what the command line asked for.
-        keep: called with the report so far after every operation, so that an interrupt loses little.
+        keep: called with the report so far after every operation: an interrupt loses little.
     """
     report = Report(name, settings.quick, environment(), [])
     for operation in chosen(operations, settings.only):
