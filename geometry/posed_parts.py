@@ -126,7 +126,7 @@ class PosedParts:
         order = torch.argsort(self.face_part, stable=True)
         counts = torch.bincount(self.face_part, minlength=self.num_parts)
         self._order = order
-        self._first = (counts.cumsum(0) - counts).tolist()
+        self._first = counts.cumsum(0) - counts
         slices = self._faces32[order].split(counts.tolist())
         self._trees = [
             [mesh(verts, tris.contiguous()) if len(tris) else None for tris in slices]
@@ -141,6 +141,20 @@ class PosedParts:
         other.shell = self.shell.filled()
         return other
 
+    def _search(
+        self, points: Tensor, body: Tensor, candidates: Tensor, radius: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Per part and point: face within that part's own mesh (-1: none) and two barycentrics."""
+        from .kernels.closest import closest_on_parts
+        from .kernels.launch import launch, view
+
+        count = points.shape[0]
+        face = torch.zeros(self.num_parts, count, dtype=torch.int32, device=self.device)
+        bary = torch.zeros(self.num_parts, count, 2, device=self.device)
+        args = [view(self._ids), view(points, 3), view(body), view(candidates), view(radius)]
+        launch(closest_on_parts, count, [*args, view(face), view(bary, 2)], points)
+        return face, bary
+
     def pairs(self, samples: ShellSamples) -> PartPairs:
         """Every (sample, part) whose part surface is within that part's radius.
 
@@ -150,18 +164,9 @@ class PosedParts:
         Returns:
             The pairs, sorted by part, then by sample.
         """
-        from .kernels.closest import closest_on_parts
-        from .kernels.launch import launch, view
-
-        count = samples.points.shape[0]
-        face = torch.zeros(self.num_parts, count, dtype=torch.int32, device=self.device)
-        bary = torch.zeros(self.num_parts, count, 2, device=self.device)
-        args = [view(self._ids), view(samples.points, 3), view(samples.body)]
-        args += [view(samples.candidates), view(self.radius), view(face), view(bary, 2)]
-        launch(closest_on_parts, count, args, samples.points)
+        face, bary = self._search(samples.points, samples.body, samples.candidates, self.radius)
         part, sample = torch.nonzero(face >= 0, as_tuple=True)
-        first = torch.tensor(self._first, device=self.device)
-        found = self._order[first[part] + face[part, sample].long()]
+        found = self._order[self._first[part] + face[part, sample].long()]
         counts = torch.bincount(part, minlength=self.num_parts).tolist()
         return PartPairs(sample, part, found, bary[part, sample], tuple(counts))
 
@@ -199,23 +204,15 @@ class PosedParts:
             part: part of each point.
             reach: search radius, metres.
         """
-        from .kernels.closest import closest_on_parts
-        from .kernels.launch import launch, view
-
         count = points.shape[0]
         queries = points.detach().float().contiguous()
-        face = torch.zeros(self.num_parts, count, dtype=torch.int32, device=self.device)
-        bary = torch.zeros(self.num_parts, count, 2, device=self.device)
         body = torch.zeros(count, dtype=torch.int32, device=self.device)
-        bits = (1 << part).int()
         radius = torch.full_like(self.radius, reach)
-        args = [view(self._ids), view(queries, 3), view(body), view(bits), view(radius)]
-        launch(closest_on_parts, count, [*args, view(face), view(bary, 2)], queries)
+        face, bary = self._search(queries, body, (1 << part).int(), radius)
         rows = torch.arange(count, device=self.device)
         local = face[part, rows]
         found = local >= 0
-        first = torch.tensor(self._first, device=self.device)
-        index = self._order[(first[part] + local) * found]
+        index = self._order[(self._first[part] + local) * found]
         two = bary[part, rows]
         full = torch.cat([two, 1.0 - two.sum(-1, keepdim=True)], -1)
         uv = (full[..., None] * self.corner_uv[index]).sum(-2)

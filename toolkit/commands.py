@@ -145,7 +145,7 @@ def _trained(
             say(f"going on from step {trainer.result.iterations}")
     with stages.timed("kernels (compiled once per machine)"):
         trainer.warm_up()
-    say(f"{record.name}: training preset {config.preset} on {len(trainer.cameras)} images")
+    say(f"{record.name}: training preset {config.preset} on {len(trainer.body_of_image)} images")
     interrupted = _run_loop(trainer)
     stages.seconds["training"] = trainer.result.seconds
     result = trainer.result

@@ -5,10 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from monopart.fields.residual import ResidualField
-from monopart.geometry.consistency import consistency_loss
 from monopart.geometry.posed_parts import PosedParts
 
-from .config import LossConfig
 from .model import AvatarModel, FrameInput, Rendered
 
 
@@ -57,8 +55,3 @@ def round_trip_distance(
     gap = (out.samples.points[sample] - posed_point).square().sum(-1)
     positive = (gap > 0) & hit.found
     return torch.where(positive, torch.where(positive, gap, 1.0).sqrt(), 0.0)
-
-
-def consistency_term(distance: Float[Tensor, "m"], spec: LossConfig) -> Float[Tensor, ""]:
-    """The consistency loss of a step, metres."""
-    return consistency_loss(distance, spec.consistency_threshold)

@@ -13,13 +13,14 @@ from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from monopart.geometry.cameras import Rays
+from monopart.geometry.consistency import consistency_loss
 from monopart.geometry.errors import MonopartError
 
 from .avatar import Avatar
 from .captures.patches import PixelBatch, PixelSampler
 from .checkpoint import save_weights
 from .config import Config
-from .losses import color_loss, consistency_term, offset_loss, round_trip_distance
+from .losses import color_loss, offset_loss, round_trip_distance
 from .lpips import LPIPS, load_lpips
 from .model import Rendered
 from .resume import forget_state, save_state
@@ -73,7 +74,6 @@ class Trainer:
         self.sampler = PixelSampler(images, masks, self.config.train.band)
         self.scene = avatar.scene(train.frames)
         self.body_of_image = torch.tensor([train.frames.index(f) for _, f in train.pairs()])
-        self.cameras = [avatar.record.cameras[c] for c, _ in train.pairs()]
         self.camera_of_image = torch.tensor([train.cameras.index(c) for c, _ in train.pairs()])
         self.train_cameras = [avatar.record.cameras[c] for c in train.cameras]
         self.canonical = avatar.canonical_parts() if self.config.loss.consistency else None
@@ -184,7 +184,9 @@ class Trainer:
                 out,
                 rows,
             )
-            terms["consistency"] = spec.consistency * consistency_term(distance, spec)
+            terms["consistency"] = spec.consistency * consistency_loss(
+                distance, spec.consistency_threshold
+            )
         return terms
 
     def step(self, step: int, done: float) -> dict[str, float]:

@@ -87,13 +87,9 @@ def launch(kernel: Any, count: int, args: list[Any], like: Tensor, smallest: int
     if count == 0:
         return
     init()
-    if like.device.type == "cuda":
-        stream = wp.stream_from_torch(torch.cuda.current_stream(like.device))
-        wp.launch(kernel, dim=count, inputs=[0, *args], stream=stream)
-        return
     threads = torch.get_num_threads()
-    if threads == 1 or count < smallest:
-        wp.launch(kernel, dim=count, inputs=[0, *args], device="cpu")
+    if like.device.type == "cuda" or threads == 1 or count < smallest:
+        launch_one(kernel, count, args, like)
         return
     cuts = [count * i // threads for i in range(threads + 1)]
     _run_side_by_side(kernel, [(b - a, [a, *args]) for a, b in itertools.pairwise(cuts)])
