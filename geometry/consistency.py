@@ -7,6 +7,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from .errors import InputError
+from .norms import safe_norm
 
 
 def round_trip(
@@ -27,9 +28,7 @@ def round_trip(
     >>> round_trip(torch.zeros(2, 3), lambda p: p + 1.0, lambda c: c - 1.0)
     tensor([0., 0.])
     """
-    square = (points - forward(backward(points))).square().sum(-1)
-    zero = square == 0
-    return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())
+    return safe_norm(points - forward(backward(points)))
 
 
 def consistency_loss(distance: Shaped[Tensor, "..."], threshold: float = 0.05) -> Float[Tensor, ""]:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .errors import BackendError, InputError
+from .norms import safe_norm
 
 _CHUNK = 1 << 22  # (point, face) pairs of one step of the reference
 
@@ -94,13 +95,6 @@ def closest_on_triangle(
     return torch.where(inside[..., None], face_bary, edge_bary)
 
 
-def _norm(vectors: Tensor) -> Tensor:
-    """Length whose gradient at zero is zero instead of NaN; NaN stays NaN."""
-    square = vectors.square().sum(-1)
-    zero = square == 0
-    return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())
-
-
 def _check(points: Tensor, verts: Tensor, faces: Tensor) -> None:
     if faces.shape[0] == 0:
         raise InputError("faces: expected at least one triangle, found 0; pass a mesh with faces")
@@ -123,7 +117,7 @@ def _hit(points: Tensor, verts: Tensor, faces: Tensor, face: Tensor, limit: floa
     triangles = verts[faces[face]]
     bary = closest_on_triangle(points, triangles)
     point = (bary[..., None] * triangles).sum(-2)
-    distance = _norm(points - point)
+    distance = safe_norm(points - point)
     found = found & (distance <= limit)
     distance = torch.where(found, distance, math.inf)
     return SurfaceHit(face * found, bary, point, distance, found)
@@ -304,7 +298,7 @@ def vertex_normals(
     total = torch.zeros_like(verts)
     for corner in range(3):
         total = total.index_add(-2, faces[:, corner], cross)
-    length = _norm(total)[..., None]
+    length = safe_norm(total)[..., None]
     return torch.where(length > 0, total / torch.where(length > 0, length, 1.0), 0.0)
 
 

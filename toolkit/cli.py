@@ -5,7 +5,7 @@ Nothing heavy is imported here: help must be there at once, and an extra that is
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from monopart.geometry.errors import MonopartError
 
@@ -25,25 +25,43 @@ def main(argv: Sequence[str] | None = None) -> int | None:
     """
     # Threads that wait must sleep, not spin: a busy machine would otherwise stall at each barrier.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    try:
+
+    def work() -> None:
         from .arguments import parse
 
         parse(sys.argv[1:] if argv is None else argv).run()
+
+    return guarded("monopart", INSTALL, work)
+
+
+def guarded(program: str, install: str, work: Callable[[], None]) -> int | None:
+    """Run a program's work and turn what stops it into one line and an exit code.
+
+    Args:
+        program: name in front of the line.
+        install: the command that brings a package that is missing.
+        work: what the program does.
+
+    Returns:
+        None when all is well, 2 for bad input, 130 after an interrupt.
+    """
+    try:
+        work()
     except MonopartError as error:
-        return _fail(str(error))
+        return _fail(program, str(error))
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
         if not missing or missing == "monopart":
             raise
-        return _fail(f"the package {missing} is not installed; install it by {INSTALL}")
+        return _fail(program, f"the package {missing} is not installed; install it by {install}")
     except KeyboardInterrupt:
-        print("monopart: interrupted", file=sys.stderr)
+        print(f"{program}: interrupted", file=sys.stderr)
         return INTERRUPTED
     return None
 
 
-def _fail(message: str) -> int:
-    print(f"monopart: error: {' '.join(message.split())}", file=sys.stderr)
+def _fail(program: str, message: str) -> int:
+    print(f"{program}: error: {' '.join(message.split())}", file=sys.stderr)
     return BAD_INPUT
 
 

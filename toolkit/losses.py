@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from monopart.fields.residual import ResidualField
+from monopart.geometry.norms import safe_norm
 from monopart.geometry.posed_parts import PosedParts
 
 from .model import AvatarModel, FrameInput, Rendered
@@ -52,6 +53,5 @@ def round_trip_distance(
         counts = torch.bincount(part, minlength=model.num_parts).tolist()
         uvt = torch.cat([hit.uv, frames.time[owner, None]], -1)
         posed_point = posed_point + forward(uvt, part, counts)
-    gap = (out.samples.points[sample] - posed_point).square().sum(-1)
-    positive = (gap > 0) & hit.found
-    return torch.where(positive, torch.where(positive, gap, 1.0).sqrt(), 0.0)
+    gap = safe_norm(out.samples.points[sample] - posed_point)
+    return torch.where(hit.found, gap, 0.0)

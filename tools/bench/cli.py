@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from monopart.geometry.errors import MonopartError
+from monopart.toolkit.cli import guarded
 
 from .registry import Settings
 
@@ -63,24 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int | None:
         None when all is well, 2 for bad input, 130 after an interrupt.
     """
     arguments = parser().parse_args(argv)
-    try:
-        _run(arguments)
-    except MonopartError as error:
-        return _fail(str(error))
-    except ModuleNotFoundError as error:
-        missing = (error.name or "").partition(".")[0]
-        if not missing or missing == "monopart":
-            raise
-        return _fail(f"the package {missing} is not installed; install it by {INSTALL}")
-    except KeyboardInterrupt:
-        print("monopart-bench: interrupted", file=sys.stderr)
-        return 130
-    return None
-
-
-def _fail(message: str) -> int:
-    print(f"monopart-bench: error: {' '.join(message.split())}", file=sys.stderr)
-    return 2
+    return guarded("monopart-bench", INSTALL, lambda: _run(arguments))
 
 
 def _run(arguments: argparse.Namespace) -> None:
