@@ -49,8 +49,8 @@ class PixelSampler:
         self.boxes = [_box(m) for m in masks]
 
     def random(self, count: int, generator: torch.Generator) -> PixelBatch:
-        """Uniformly random pixels of all images."""
-        pick = torch.randint(int(self.end[-1]), (count,), generator=generator)
+        """Uniformly random pixels of all images, in order: neighbours share the body's memory."""
+        pick = torch.randint(int(self.end[-1]), (count,), generator=generator).sort().values
         image = torch.searchsorted(self.end, pick, right=True)
         return self._batch(image, self.pixel[pick].long())
 
