@@ -1,8 +1,8 @@
 """Trees over the faces of moving meshes: 8 children a node, 8 faces a leaf, refit as bodies move.
 
 One topology serves any number of bodies (the frames of a capture), and a mesh may be cut into
-groups (the parts of a body) with a tree each. The shape of a tree is fixed by median splits of one
-posture; only boxes and corners follow the vertices. Node ``n`` has the children 8n + 1 … 8n + 8.
+groups (the parts of a body) with a tree each. The shape of a tree is fixed by cuts of one posture;
+only boxes and corners follow the vertices. Node ``n`` has the children 8n + 1 … 8n + 8.
 Reference for the width: I. Wald et al., Getting Rid of Packets, 2008 (one vector per node).
 """
 
@@ -82,7 +82,10 @@ class FaceTrees:
         self.layout = torch.tensor(layout, dtype=torch.int64, device=self.device)
         flat = np.concatenate([t.reshape(-1) for t in trees])
         self.slots = torch.from_numpy(flat.astype(np.int32)).to(self.device)
-        self.boxes = torch.full((max(box, 1), LANES), FAR, device=self.device)
+        # a child that is not there: a box that is far from everything and changes no union
+        empty = torch.tensor([FAR, -FAR], device=self.device).repeat_interleave(BOX_ROWS // 2)
+        nodes = max(box, BOX_ROWS) // BOX_ROWS
+        self.boxes = empty.repeat(nodes)[:, None].expand(-1, LANES).contiguous()
         self.tris = torch.zeros(max(tri, 1), LANES, device=self.device)
 
     def refit(self, verts: Float[Tensor, "b v 3"]) -> None:
@@ -133,24 +136,40 @@ def _levels(leaves: int) -> int:
 
 
 def _split(centres: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Leaves [L, 8] of some faces, -1 where not full, L a power of two: median splits.
+    """Leaves [L, 8] of some faces, -1 where the last one is not full, in the order of the tree.
 
-    All segments of a level are split at once, each along its longest axis.
+    All pieces of a level are cut at once, each along its longest axis, where a child is full: so
+    the leaves are full, and only the last subtree of a level is smaller than its siblings.
     """
-    count = len(rows)
-    if count == 0:
+    if len(rows) == 0:
         return np.zeros((0, 8), int)
-    order, pieces = rows, 1
-    while pieces * 8 < count:
-        cuts = count * np.arange(pieces + 1) // pieces
-        own = centres[order]
-        extent = np.maximum.reduceat(own, cuts[:-1]) - np.minimum.reduceat(own, cuts[:-1])
-        segment = np.repeat(np.arange(pieces), np.diff(cuts))
-        key = own[np.arange(count), extent.argmax(1)[segment]]
-        order = order[np.lexsort((key, segment))]
-        pieces *= 2
-    cuts = count * np.arange(pieces + 1) // pieces
-    leaf = np.repeat(np.arange(pieces), np.diff(cuts))
-    leaves = np.full((pieces, 8), -1)
-    leaves[leaf, np.arange(count) - cuts[leaf]] = order
+    order, first = rows, np.zeros(1, int)
+    capacity = 8 ** (_levels(-(-len(rows) // 8)) + 1)  # faces below one node of the level
+    while capacity > 8:
+        capacity //= 8
+        sizes = np.diff(first, append=len(rows))
+        children = -(-sizes // capacity)
+        for _ in range(3):  # up to eight children by three halvings
+            order = _sort_pieces(centres, order, first, children > 1)
+            left = (children + 1) // 2
+            cut = children > 1
+            starts = np.concatenate([first, (first + left * capacity)[cut]])
+            counts = np.concatenate([np.where(cut, left, children), (children - left)[cut]])
+            place = starts.argsort(kind="stable")
+            first, children = starts[place], counts[place]
+    leaf = np.repeat(np.arange(len(first)), np.diff(first, append=len(rows)))
+    leaves = np.full((len(first), 8), -1)
+    leaves[leaf, np.arange(len(rows)) - first[leaf]] = order
     return leaves
+
+
+def _sort_pieces(
+    centres: np.ndarray, order: np.ndarray, first: np.ndarray, wanted: np.ndarray
+) -> np.ndarray:
+    """Sort the wanted pieces along their longest axes; the others stay as they are."""
+    own = centres[order]
+    extent = np.maximum.reduceat(own, first) - np.minimum.reduceat(own, first)
+    piece = np.repeat(np.arange(len(first)), np.diff(first, append=len(order)))
+    along = own[np.arange(len(order)), extent.argmax(1)[piece]]
+    key = np.where(wanted[piece], along, np.arange(len(order)))
+    return order[np.lexsort((key, piece))]

@@ -23,6 +23,7 @@ _MIX = """
 
 _KEY = wp.constant(wp.int64(1 << 32))
 EMPTY = (1 << 63) - 1
+ROUGH_STEPS = wp.constant(1)  # a second one costs more than it saves (measured)
 _EMPTY = wp.constant(wp.int64(EMPTY))
 
 
@@ -283,7 +284,7 @@ def solve(
 ):
     """Solve x = A(w(p)) p from a guess: Newton steps, or re-queries where ``gradients`` is 0.
 
-    The first step of a guess with a hint takes the weights of the hint's leaf, which are cheap and
+    The first steps of a guess with a hint take the weights of the hint's leaf, which are cheap and
     near enough to step by; only residuals with the closest face count.
     After a step that did not help, the next one re-queries only. A point that did not arrive starts
     again from the inverse of its nearest bones. ``limits``: residual that ends the iterations,
@@ -301,12 +302,12 @@ def solve(
     f = int(-1)
     k = int(0)
     attempt = int(0)
-    rough = bool(False)
+    rough = int(0)
     if hint[i] >= 0 and iterations > 0:
-        rough = True
+        rough = ROUGH_STEPS
     while attempt < starts:
         over = bool(False)
-        if rough:
+        if rough > 0:
             f = closest_in_leaf(p, layout, tris, slots, places, hint[i])
         else:
             f = closest_from(p, f, layout, boxes, tris, slots, verts, faces, limits[3])
@@ -333,15 +334,15 @@ def solve(
             step, det = solve_rows(r0, r1, r2, e)
             ok = wp.abs(det) > limits[2]
             better = r < last
-            if not rough:
+            if rough == 0:
                 last = r
-            if r < best and not rough:
+            if r < best and rough == 0:
                 best = r
                 best_p = p
                 best_w = w
                 best_face = f
                 best_ok = ok
-            over = over or (r <= limits[0] and not rough)
+            over = over or (r <= limits[0] and rough == 0)
             if gradients != 0 and better and not over:
                 gb, gc = bary_gradients(w, a, b, c)
                 r0 += gb * wp.dot(b0 - a0, h) + gc * wp.dot(c0 - a0, h)
@@ -356,7 +357,7 @@ def solve(
             if size > 0.2:
                 step = step * (0.2 / size)
             p = p + step
-        rough = False
+        rough = wp.max(rough - 1, 0)
         if over:
             attempt += 1
             if best <= limits[1]:
