@@ -325,10 +325,8 @@ def convert_smplx_translation(
 
 def _combine(base: Tensor, rows: Tensor, coefficients: Tensor) -> Tensor:
     """Vectors (*b, V, 3) of a mean (V, 3), directions (B, 3 V) and coefficients (*b, B)."""
-    batch, count = coefficients.shape[:-1], coefficients.shape[-1]
-    flat = coefficients.reshape(batch.numel(), count)
-    # one product that starts from the mean: a sum of its own would read the vertices again
-    return torch.addmm(base.flatten(), flat, rows).view(*batch, *base.shape)
+    # the small terms are summed first: a product that starts from the mean rounds at its size
+    return base + (coefficients @ rows).unflatten(-1, base.shape)
 
 
 @functools.cache
