@@ -64,11 +64,12 @@ def _vertex_reach(verts: Tensor, faces: Tensor) -> Tensor:
 
     No point of a triangle is farther than (longest edge)/sqrt(3) from the nearest corner.
     """
-    sides = torch.stack([faces, faces.roll(-1, dims=1)], -1).reshape(-1, 2)
-    edges, row = sides.sort(-1).values.unique(dim=0, return_inverse=True)  # two faces share one
-    along = verts[:, edges[:, 0]] - verts[:, edges[:, 1]]
+    sides = torch.stack([faces, faces.roll(-1, dims=1)], -1)
+    single = sides.amin(-1) * verts.shape[1] + sides.amax(-1)  # two faces share an edge
+    edges, row = single.unique(return_inverse=True)
+    along = verts[:, edges // verts.shape[1]] - verts[:, edges % verts.shape[1]]
     length = along.square_().sum(-1).amax(0).sqrt()
-    longest = length[row].reshape(-1, 3).amax(1) / 3**0.5
+    longest = length[row].amax(1) / 3**0.5
     reach = torch.zeros(verts.shape[1], dtype=verts.dtype, device=verts.device)
     return reach.scatter_reduce(0, faces.reshape(-1), longest.repeat_interleave(3), "amax")
 

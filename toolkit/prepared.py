@@ -6,7 +6,7 @@ The geometry itself knows nothing of files: it takes finished tensors as argumen
 from importlib import metadata
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Integer
 from torch import Tensor
 
 from monopart.fields import distance_prior as prior_code
@@ -88,7 +88,7 @@ def body_shell(
     )
 
 
-def narrowed(bits: Int[Tensor, "n"], width: int) -> Int[Tensor, "n"]:
+def narrowed(bits: Integer[Tensor, "n"], width: int) -> Integer[Tensor, "n"]:
     """Bit sets in the smallest whole numbers that hold them.
 
     Args:

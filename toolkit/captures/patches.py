@@ -99,5 +99,6 @@ def _grown(mask: np.ndarray, box: tuple[int, int, int, int], band: int) -> np.nd
     if not near.size:
         return np.zeros(0, np.int32)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band + 1, 2 * band + 1))
-    rows, columns = np.nonzero(cv2.dilate(near, kernel))
-    return ((rows + top) * mask.shape[1] + columns + left).astype(np.int32)
+    inside = np.flatnonzero(cv2.dilate(near, kernel).view(bool))
+    skipped = (inside // near.shape[1]) * (mask.shape[1] - near.shape[1])
+    return (inside + skipped + top * mask.shape[1] + left).astype(np.int32)
