@@ -137,15 +137,20 @@ def _trained(
         check_free(out)
     with stages.timed("reading and body geometry"), progress_bar("Reading") as update:
         record, cache = read_capture(capture, params=params), user_cache(say)
-        pictures = read_pictures(record, "train", cache, counted(update))
+        pictures = read_pictures(
+            record, "train", cache, lambda i, n: update(0.6 * i / n, f"image {i}/{n}")
+        )
         check_capture(record, deep=True, masks=pictures.masks)
         run = out if resume else create_run(out, config, record)
         torch.manual_seed(config.seed)
+        update(0.6, "canonical body")
         avatar = Avatar.create(record, config, cache)
+        update(0.8, "posed bodies")
         trainer = Trainer(avatar, run, pictures=pictures)
         if resume:
             load_state(trainer, run)
             say(f"going on from step {trainer.result.iterations}")
+        update(1.0, "")
     with stages.timed("kernels (compiled once per machine)"):
         trainer.warm_up()
     say(f"{record.name}: training preset {config.preset} on {len(trainer.body_of_image)} images")

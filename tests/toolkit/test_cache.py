@@ -4,6 +4,7 @@ import errno
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -93,7 +94,7 @@ def test_training_with_a_warm_cache_equals_a_cold_one_and_none(
 
     marked = BodyShell._marked
 
-    def few(self: BodyShell, verts: torch.Tensor, *rest: object) -> torch.Tensor:
+    def few(self: BodyShell, verts: torch.Tensor, *rest: Any) -> torch.Tensor:
         assert len(verts) == 1, "only the one canonical body may be built anew"
         return marked(self, verts, *rest)
 
@@ -317,7 +318,7 @@ def test_unfinished_files_of_dead_processes_are_removed(tmp_path: Path, told: To
     dead, alive = (tmp_path / f".{path.stem}.{c * 8}.safetensors" for c in "ab")
     dead.write_bytes(b"x")
     alive.write_bytes(b"x")
-    os.utime(dead, (time.time() - 1e5,) * 2)
+    os.utime(dead, (0.0, 0.0))
     numbers(cache, 7)
     assert alive.exists() and not dead.exists()
 
