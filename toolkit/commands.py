@@ -135,7 +135,7 @@ def _trained(
         config, params = resumable(out)
     else:
         check_free(out)
-    with stages.timed("reading and body geometry"), progress_bar("Reading") as update:
+    with stages.timed("reading and body geometry"), progress_bar("Reading", True) as update:
         record, cache = read_capture(capture, params=params), user_cache(say)
         pictures = read_pictures(
             record, "train", cache, lambda i, n: update(0.6 * i / n, f"image {i}/{n}")
