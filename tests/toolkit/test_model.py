@@ -204,3 +204,9 @@ def test_training_does_not_import_torch_compile(capture: Path) -> None:
         "assert 'torch._dynamo' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code, str(capture)], check=True)
+
+
+def test_voxels_are_those_of_the_configuration(capture: Path) -> None:
+    avatar = make(capture, small(geometry={"voxel": 0.04}, field={"prior_slope": 0.0}))
+    assert avatar.scene((0, 1)).parts.shell.voxel == 0.04
+    assert avatar.pose_scene(avatar.record.poses[0]).parts.shell.voxel == 0.04
