@@ -19,7 +19,11 @@ from .presets import preset, preset_names
 PROGRAM = """Animatable avatars from monocular video.
 
 CAPTURE is a folder in the layout of ZJU-MoCap; RUN is a folder that training makes. Results go to
-stdout, progress to stderr. Bad input: one line and exit code 2; interrupt: 130."""
+stdout, progress to stderr. Bad input: one line and exit code 2; interrupt: 130.
+
+What takes long to prepare is kept in ~/.cache/monopart/frames (XDG_CACHE_HOME is heeded), at most
+in 4 GB. MONOPART_CACHE names another folder, or "off"; MONOPART_CACHE_GB another limit; monopart
+info tells where it is and how large."""
 SPLITS = ("novel_view", "novel_pose")
 OF_PRESET = "(default: the preset's)"
 

@@ -1,5 +1,6 @@
 """The training loop: batches, losses, optimiser, moving average, log lines and checkpoints."""
 
+import inspect
 import json
 import math
 import time
@@ -17,6 +18,7 @@ from monopart.geometry.consistency import consistency_loss
 from monopart.geometry.errors import MonopartError
 
 from .avatar import Avatar
+from .captures.cache import Pictures, read_pictures
 from .captures.patches import PixelBatch, PixelSampler
 from .checkpoint import save_weights
 from .config import Config
@@ -59,6 +61,7 @@ class Trainer:
         avatar: Avatar,
         run: Path | None = None,
         progress: Callable[[int, int], None] | None = None,
+        pictures: Pictures | None = None,
     ) -> None:
         """Read the images and pose the bodies, once.
 
@@ -66,12 +69,13 @@ class Trainer:
             avatar: the avatar to train.
             run: folder for train.jsonl and checkpoints; None writes nothing.
             progress: called with (done, total) as images are read.
+            pictures: the training images where a caller has read them already.
         """
         self.avatar, self.run_folder = avatar, run
         self.config = avatar.config
         train = avatar.record.split("train")
-        images, masks = avatar.record.stack("train", progress)
-        self.sampler = PixelSampler(images, masks, self.config.train.band)
+        seen = pictures or read_pictures(avatar.record, "train", avatar.cache, progress)
+        self.sampler = PixelSampler(seen.images, seen.masks, self.config.train.band)
         self.scene = avatar.scene(train.frames)
         self.body_of_image = torch.tensor([train.frames.index(f) for _, f in train.pairs()])
         self.camera_of_image = torch.tensor([train.cameras.index(c) for c, _ in train.pairs()])
@@ -306,6 +310,16 @@ class Trainer:
             file.write(json.dumps(row) + "\n")
 
 
+class Adam(torch.optim.Adam):
+    """Torch's Adam, bit for bit, without its import of torch.compile, which takes over a second."""
+
+    add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
+    zero_grad = inspect.unwrap(torch.optim.Adam.zero_grad)
+    state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
+    load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
+    step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
+
+
 def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam:
     """Adam with the rates of hash tables and of everything else."""
     tables = [p for n, p in model.named_parameters() if n.endswith("grid.table")]
@@ -314,7 +328,7 @@ def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam:
         {"params": tables, "base_lr": config.train.lr_table},
         {"params": others, "base_lr": config.train.lr_network},
     ]
-    return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
+    return Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
 def _joined(a: PixelBatch, b: PixelBatch) -> PixelBatch:

@@ -155,6 +155,10 @@ def test_info(trained_run, small_capture, capsys):
     assert cli.main(["info", str(small_capture)]) is None
     facts = json.loads(capsys.readouterr().out)
     assert facts["image_size"] == [48, 48] and facts["check"]["images"] == 3
+    cache = facts["cache"]
+    assert (
+        cache["folder"] == os.environ["MONOPART_CACHE"] and cache["entries"] >= 2
+    )  # images and shells; the tiny run has no prior
     assert cli.main(["info", str(trained_run)]) is None
     facts = json.loads(capsys.readouterr().out)
     assert facts["config"]["train"]["rays"] == 128 and "novel_view" in facts["metrics"]

@@ -1,5 +1,7 @@
 """The avatar model: exact skipping, gradients everywhere, determinism."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,7 @@ from monopart.toolkit.checkpoint import load_weights, save_weights
 from monopart.toolkit.config import Config
 from monopart.toolkit.presets import preset, with_overrides
 from monopart.toolkit.render import render_view
-from monopart.toolkit.train import Trainer
+from monopart.toolkit.train import Trainer, make_optimizer
 
 
 def small(**sections: dict) -> Config:
@@ -158,3 +160,53 @@ def test_a_loss_that_is_not_finite_is_skipped_and_named(
     with pytest.raises(MonopartError, match="mse"):
         for step in range(1, 30):
             trainer.step(step, 0.0)
+
+
+def test_the_optimiser_is_adam_of_torch(capture: Path) -> None:
+    config = small(field={"prior_slope": 0.0})
+    ours, theirs = make(capture, config).model, make(capture, config).model
+    mine = make_optimizer(ours, config)
+    groups = [
+        {"params": [dict(theirs.named_parameters())[n] for n in names], "lr": 1e-3}
+        for names in (
+            [n for n, _ in ours.named_parameters() if n.endswith("grid.table")],
+            [n for n, _ in ours.named_parameters() if not n.endswith("grid.table")],
+        )
+    ]
+    reference = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
+    for step in range(4):
+        for a, b in zip(ours.parameters(), theirs.parameters(), strict=True):
+            a.grad = torch.randn(a.shape)
+            b.grad = a.grad.clone()
+        if step == 2:
+            mine.load_state_dict(mine.state_dict())
+        mine.step()
+        reference.step()
+        assert all(
+            torch.equal(a, b) for a, b in zip(ours.parameters(), theirs.parameters(), strict=True)
+        )
+    mine.zero_grad(set_to_none=True)
+    assert all(p.grad is None for p in ours.parameters())
+
+
+def test_training_does_not_import_torch_compile(capture: Path) -> None:
+    """It takes over a second, at every start, and nothing here uses it."""
+    code = (
+        "import sys, pathlib, dataclasses, torch\n"
+        "torch.set_num_threads(1)\n"
+        "from monopart.toolkit.avatar import Avatar\n"
+        "from monopart.toolkit.captures import read_capture\n"
+        "from monopart.toolkit.presets import preset, with_overrides\n"
+        "from monopart.toolkit.train import Trainer\n"
+        "config = with_overrides(preset('fast'), train={'iterations': 2, 'rays': 32},"
+        " field={'prior_slope': 0.0, 'log2_size': 8})\n"
+        "Trainer(Avatar.create(read_capture(pathlib.Path(sys.argv[1])), config)).loop()\n"
+        "assert 'torch._dynamo' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code, str(capture)], check=True)
+
+
+def test_voxels_are_those_of_the_configuration(capture: Path) -> None:
+    avatar = make(capture, small(geometry={"voxel": 0.04}, field={"prior_slope": 0.0}))
+    assert avatar.scene((0, 1)).parts.shell.voxel == 0.04
+    assert avatar.pose_scene(avatar.record.poses[0]).parts.shell.voxel == 0.04
