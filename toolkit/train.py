@@ -19,10 +19,10 @@ from monopart.geometry.errors import MonopartError
 from .avatar import Avatar
 from .captures.patches import PixelBatch, PixelSampler
 from .checkpoint import save_weights
-from .config import Config
 from .losses import color_loss, offset_loss, round_trip_distance
 from .lpips import LPIPS, load_lpips
 from .model import Rendered
+from .optimizer import make_optimizer
 from .resume import forget_state, save_state
 
 MAX_BAD_STEPS = 20  # non-finite losses in a row after which a run ends
@@ -304,17 +304,6 @@ class Trainer:
         }
         with (self.run_folder / "train.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
-
-
-def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam:
-    """Adam with the rates of hash tables and of everything else."""
-    tables = [p for n, p in model.named_parameters() if n.endswith("grid.table")]
-    others = [p for n, p in model.named_parameters() if not n.endswith("grid.table")]
-    groups = [
-        {"params": tables, "base_lr": config.train.lr_table},
-        {"params": others, "base_lr": config.train.lr_network},
-    ]
-    return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
 def _joined(a: PixelBatch, b: PixelBatch) -> PixelBatch:

@@ -133,6 +133,26 @@ def test_other_part_tables_train(capture: Path, parts: str) -> None:
     assert bool(render_view(avatar, view_of(avatar.record, 0, 0)).color.isfinite().all())
 
 
+def test_the_sparse_optimizer_learns_and_keeps_the_gradient_buffers(capture: Path) -> None:
+    first = {}
+    for sparse in (False, True):
+        avatar = make(capture, small(train={"sparse_optimizer": sparse, "ema": 0.0}))
+        trainer = Trainer(avatar)
+        trainer.warm_up()
+        trainer.step(0, 0.0)
+        first[sparse] = {k: v.detach().clone() for k, v in avatar.model.named_parameters()}
+    for name, value in first[False].items():  # in the first step no row has missed one
+        torch.testing.assert_close(value, first[True][name], rtol=1e-4, atol=1e-4)
+    table = avatar.model.field.grid.table
+    place = table.grad.data_ptr()
+    before = trainer.last["mse"]
+    for step in range(1, 10):
+        trainer.step(step, 0.0)
+    assert trainer.last["mse"] < before
+    assert table.grad.data_ptr() == place
+    assert not table.grad.any()
+
+
 def test_warming_up_changes_nothing(capture: Path) -> None:
     avatar = make(capture, small())
     trainer = Trainer(avatar)
