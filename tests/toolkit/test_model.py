@@ -6,7 +6,7 @@ import pytest
 import torch
 from miniature import write_miniature
 
-from monopart.geometry.errors import MonopartError
+from monopart.geometry.errors import InputError, MonopartError
 from monopart.toolkit.avatar import Avatar, view_of
 from monopart.toolkit.captures import read_capture
 from monopart.toolkit.checkpoint import load_weights, save_weights
@@ -58,6 +58,29 @@ def test_learned_pruning_changes_the_image_little_and_evaluates_less(capture: Pa
     exact, pruned = render_view(avatar, view), render_view(avatar, view, prune=1e-3)
     assert pruned.stats["pairs_evaluated"] < exact.stats["pairs_evaluated"]
     assert float((exact.color - pruned.color).abs().mean()) < 2e-3
+
+
+def test_coarse_to_fine_changes_the_image_little_and_evaluates_less(trained: Avatar) -> None:
+    view = view_of(trained.record, 0, 0)
+    exact = render_view(trained, view)
+    assert torch.equal(render_view(trained, view, coarse=1).color, exact.color)
+    for factor in (2, 4):
+        found = render_view(trained, view, coarse=factor)
+        assert found.stats["samples_evaluated"] < exact.stats["samples_evaluated"]
+        assert float((exact.color - found.color).abs().max()) < 2e-2
+        assert float((exact.color - found.color).abs().mean()) < 1e-3
+    with pytest.raises(InputError, match="coarse"):
+        render_view(trained, view, coarse=2, skip=False)
+    with pytest.raises(InputError, match="coarse"):
+        render_view(trained, view, coarse=0)
+
+
+def test_half_networks_change_the_image_little_and_leave_the_model(trained: Avatar) -> None:
+    view = view_of(trained.record, 0, 0)
+    exact, found = render_view(trained, view), render_view(trained, view, half=True)
+    largest = float((exact.color - found.color).abs().max())
+    assert 0 < largest < 2e-2
+    assert torch.equal(render_view(trained, view).color, exact.color)
 
 
 def test_the_untrained_avatar_is_already_a_person(capture: Path) -> None:
