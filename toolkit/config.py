@@ -118,7 +118,7 @@ class TrainConfig:
     """Factor of both rates at the end, reached exponentially."""
     sparse_optimizer: bool = False
     """Step only the rows of the hash tables that received a gradient (approximate); pays where
-    `field.log2_size` is 17 or more."""
+    `field.log2_size` is 19 or more."""
     ema: float = 0.98
     """Decay of the weights' moving average that is rendered and saved; 0 switches it off."""
     random_background: bool = True
