@@ -141,14 +141,26 @@ class Render:
     """Folder of the capture, if it has moved."""
     explain: bool = False
     """Print a table of the rays, samples and part evaluations that were skipped."""
+    coarse: Count = 1
+    """Look at every N-th sample of a ray first and fill in where there is something; 1 is exact."""
+    half: bool = False
+    """Run the networks in float16 (for GPUs: slower on a CPU)."""
 
     def run(self) -> None:
         """Do it."""
         check_file("--out", self.out, ".png")
+        check_count("--coarse", self.coarse)
         from . import commands
 
         commands.render(
-            self.run_folder, self.camera, self.frame, self.out, self.capture, self.explain
+            self.run_folder,
+            self.camera,
+            self.frame,
+            self.out,
+            self.capture,
+            self.explain,
+            coarse=self.coarse,
+            half=self.half,
         )
 
 

@@ -226,7 +226,14 @@ def _training_facts(path: Path) -> tuple[TrainResult, dict[str, float]]:
 
 
 def render(
-    run: Path, camera: str, frame: int, out: Path, capture: Path | None, explain: bool
+    run: Path,
+    camera: str,
+    frame: int,
+    out: Path,
+    capture: Path | None,
+    explain: bool,
+    coarse: int = 1,
+    half: bool = False,
 ) -> None:
     """Render one camera at one frame of the capture.
 
@@ -237,12 +244,14 @@ def render(
         out: picture to write.
         capture: the capture, if it has moved.
         explain: print the table of what was skipped.
+        coarse: samples of a ray per coarse one; 1 is exact.
+        half: run the networks in float16.
     """
     avatar = open_run(run, capture)
     index = avatar.record.camera_index(camera)
     view = View(avatar.record.cameras[index], pose_of(avatar.record, frame), frame)
     start = time.perf_counter()
-    picture = render_view(avatar, view)
+    picture = render_view(avatar, view, coarse=coarse, half=half)
     took = time.perf_counter() - start
     save_png(out, as_uint8(picture.color))
     why = why_empty(avatar, view, picture)

@@ -1,6 +1,5 @@
 """The training loop: batches, losses, optimiser, moving average, log lines and checkpoints."""
 
-import inspect
 import json
 import math
 import time
@@ -21,10 +20,10 @@ from .avatar import Avatar
 from .captures.cache import Pictures, read_pictures
 from .captures.patches import PixelBatch, PixelSampler
 from .checkpoint import save_weights
-from .config import Config
 from .losses import color_loss, offset_loss, round_trip_distance
 from .lpips import LPIPS, load_lpips
 from .model import Rendered
+from .optimizer import make_optimizer
 from .resume import forget_state, save_state
 
 MAX_BAD_STEPS = 20  # non-finite losses in a row after which a run ends
@@ -308,27 +307,6 @@ class Trainer:
         }
         with (self.run_folder / "train.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
-
-
-class Adam(torch.optim.Adam):
-    """Torch's Adam, bit for bit, without its import of torch.compile, which takes over a second."""
-
-    add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
-    zero_grad = inspect.unwrap(torch.optim.Adam.zero_grad)
-    state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
-    load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
-    step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
-
-
-def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam:
-    """Adam with the rates of hash tables and of everything else."""
-    tables = [p for n, p in model.named_parameters() if n.endswith("grid.table")]
-    others = [p for n, p in model.named_parameters() if not n.endswith("grid.table")]
-    groups = [
-        {"params": tables, "base_lr": config.train.lr_table},
-        {"params": others, "base_lr": config.train.lr_network},
-    ]
-    return Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
 def _joined(a: PixelBatch, b: PixelBatch) -> PixelBatch:

@@ -140,7 +140,7 @@ def test_demo_needs_its_capture(tmp_path, capsys, monkeypatch):
 def test_render_and_turntable(trained_run, tmp_path, capsys):
     picture, film = tmp_path / "a.png", tmp_path / "a.mp4"
     argv = ["render", trained_run, "--camera", "Camera_B2", "--frame", "3", "--out", picture]
-    assert cli.main([str(a) for a in (*argv, "--explain")]) is None
+    assert cli.main([str(a) for a in (*argv, "--explain", "--coarse", "2", "--half")]) is None
     seen = capsys.readouterr()
     assert seen.out == f"{picture}\n"
     assert "rendering: rays" in seen.err and "What was skipped" in seen.err

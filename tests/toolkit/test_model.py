@@ -8,14 +8,15 @@ import pytest
 import torch
 from miniature import write_miniature
 
-from monopart.geometry.errors import MonopartError
+from monopart.geometry.errors import InputError, MonopartError
 from monopart.toolkit.avatar import Avatar, view_of
 from monopart.toolkit.captures import read_capture
 from monopart.toolkit.checkpoint import load_weights, save_weights
 from monopart.toolkit.config import Config
+from monopart.toolkit.optimizer import make_optimizer
 from monopart.toolkit.presets import preset, with_overrides
 from monopart.toolkit.render import render_view
-from monopart.toolkit.train import Trainer, make_optimizer
+from monopart.toolkit.train import Trainer
 
 
 def small(**sections: dict) -> Config:
@@ -60,6 +61,29 @@ def test_learned_pruning_changes_the_image_little_and_evaluates_less(capture: Pa
     exact, pruned = render_view(avatar, view), render_view(avatar, view, prune=1e-3)
     assert pruned.stats["pairs_evaluated"] < exact.stats["pairs_evaluated"]
     assert float((exact.color - pruned.color).abs().mean()) < 2e-3
+
+
+def test_coarse_to_fine_changes_the_image_little_and_evaluates_less(trained: Avatar) -> None:
+    view = view_of(trained.record, 0, 0)
+    exact = render_view(trained, view)
+    assert torch.equal(render_view(trained, view, coarse=1).color, exact.color)
+    for factor in (2, 4):
+        found = render_view(trained, view, coarse=factor)
+        assert found.stats["samples_evaluated"] < exact.stats["samples_evaluated"]
+        assert float((exact.color - found.color).abs().max()) < 2e-2
+        assert float((exact.color - found.color).abs().mean()) < 1e-3
+    with pytest.raises(InputError, match="coarse"):
+        render_view(trained, view, coarse=2, skip=False)
+    with pytest.raises(InputError, match="coarse"):
+        render_view(trained, view, coarse=0)
+
+
+def test_half_networks_change_the_image_little_and_leave_the_model(trained: Avatar) -> None:
+    view = view_of(trained.record, 0, 0)
+    exact, found = render_view(trained, view), render_view(trained, view, half=True)
+    largest = float((exact.color - found.color).abs().max())
+    assert 0 < largest < 2e-2
+    assert torch.equal(render_view(trained, view).color, exact.color)
 
 
 def test_the_untrained_avatar_is_already_a_person(capture: Path) -> None:
@@ -133,6 +157,26 @@ def test_other_part_tables_train(capture: Path, parts: str) -> None:
     result = Trainer(avatar).loop()
     assert result.iterations == 2
     assert bool(render_view(avatar, view_of(avatar.record, 0, 0)).color.isfinite().all())
+
+
+def test_the_sparse_optimizer_learns_and_keeps_the_gradient_buffers(capture: Path) -> None:
+    first = {}
+    for sparse in (False, True):
+        avatar = make(capture, small(train={"sparse_optimizer": sparse, "ema": 0.0}))
+        trainer = Trainer(avatar)
+        trainer.warm_up()
+        trainer.step(0, 0.0)
+        first[sparse] = {k: v.detach().clone() for k, v in avatar.model.named_parameters()}
+    for name, value in first[False].items():  # in the first step no row has missed one
+        torch.testing.assert_close(value, first[True][name], rtol=1e-4, atol=1e-4)
+    table = avatar.model.field.grid.table
+    place = table.grad.data_ptr()
+    before = trainer.last["mse"]
+    for step in range(1, 10):
+        trainer.step(step, 0.0)
+    assert trainer.last["mse"] < before
+    assert table.grad.data_ptr() == place
+    assert not table.grad.any()
 
 
 def test_warming_up_changes_nothing(capture: Path) -> None:
