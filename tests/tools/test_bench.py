@@ -17,9 +17,9 @@ from monopart.geometry.errors import InputError
 from monopart.tools.bench import compare, results, suite
 from monopart.tools.bench.bodies import near_points, pose_list, surface_data
 from monopart.tools.bench.cli import main
+from monopart.tools.bench.meshes import subdivided
 from monopart.tools.bench.plots import pareto_front
 from monopart.tools.bench.registry import Method, Operation, Problem, Settings
-from monopart.tools.bench.scaling import subdivided
 from monopart.tools.bench.skinning_methods import plain_arrays, plain_skinning
 from monopart.tools.bench.surface_methods import judge_surface
 from monopart.tools.bench.timing import Effort, measure, spread
@@ -51,10 +51,11 @@ def _check_schema(path: Path, suite_name: str) -> dict:
     return data
 
 
-def _run(name: str, out: Path, *arguments: str) -> dict:
+def _run(name: str, out: Path, *arguments: str, written: str = "") -> dict:
     assert main([name, *arguments, "--quick", "--out", str(out)]) is None
-    data = _check_schema(out / f"{name}.json", name)
-    assert (out / f"{name}.md").read_text()
+    written = written or name
+    data = _check_schema(out / f"{written}.json", written)
+    assert (out / f"{written}.md").read_text()
     for plot in out.glob("*.svg"):
         ElementTree.parse(plot)
     return data
@@ -67,7 +68,9 @@ def test_geometry_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     ours = [r for r in tables["surface"]["rows"] if r["method"] == "monopart"]
     assert {r["setting"] for r in ours} == {"pose 00", "pose 01"}
     for row in tables["surface"]["rows"]:
-        assert row["error"] < 2e-6, row
+        assert row["error"] < (2e-6 if row["ours"] else 1e-4), row  # trimesh rounds more
+    methods = {r["method"] for r in tables["unskin"]["rows"]}
+    assert {"broyden on Warp's query, 1 start", "broyden on our tree, 13 starts"} <= methods
     for row in tables["skinning_backward"]["rows"]:
         assert row["error"] < 5e-6, row
         assert row["facts"]["gradient error"] < 1e-4, row
@@ -93,7 +96,7 @@ def test_fields_suite(tmp_path: Path) -> None:
             assert row["error"] < 1e-4, (table["operation"], row)
             assert row["facts"].get("gradient error", 0.0) < 1e-3, (table["operation"], row)
     compiled = [a for t in data["tables"] for a in t["absent"] if a["method"] == "torch.compile"]
-    assert len(compiled) == 4
+    assert len(compiled) == 6
 
 
 @pytest.mark.slow
@@ -115,7 +118,7 @@ def test_training_and_render_suites(tmp_path: Path, demo_capture: Path) -> None:
     from monopart.toolkit.runs import create_run
 
     out = tmp_path / "bench"
-    data = _run("training", out, str(demo_capture))
+    data = _run("training", out, str(demo_capture), written=f"training_{demo_capture.name}")
     curve = data["tables"][0]
     assert [r["size"] for r in curve["rows"]] == [2]  # steps
     for row in curve["rows"]:
@@ -130,6 +133,16 @@ def test_training_and_render_suites(tmp_path: Path, demo_capture: Path) -> None:
     rows = {r["method"]: r for r in data["tables"][0]["rows"]}
     assert rows["exact skipping"]["error"] < 1e-4
     assert 0 < rows["exact skipping"]["facts"]["rays %"] <= 100
+    data = _run("skipping", out, str(run))
+    (left,) = data["tables"][0]["rows"][:1]
+    facts = left["facts"]
+    assert left["error"] < 1e-4
+    assert facts["reach a network %"] <= facts["within a part's radius %"]
+    assert facts["within a part's radius %"] <= facts["in shell voxels %"] <= facts["in the box %"]
+    steps = {r["method"]: r for r in data["tables"][1]["rows"] if "person" in r["setting"]}
+    every = next(r for name, r in steps.items() if name.startswith("nothing skipped"))
+    assert steps["exact skipping only"]["error"] < 1e-4
+    assert steps["exact skipping only"]["facts"]["pairs"] < every["facts"]["pairs"]
 
 
 def test_absent_peers_name_their_install_line() -> None:

@@ -15,6 +15,7 @@ SUITES = {
     "fields": "hash grid, compositing, networks",
     "training": "PSNR against seconds of every preset on CAPTURE",
     "render": "seconds per picture of RUN",
+    "skipping": "samples that are left of a picture of RUN, and what a training step saves",
     "scaling": "time against rays, samples, frames, parts, vertices, threads",
 }
 
@@ -33,11 +34,11 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument("capture", type=Path, metavar="CAPTURE")
             command.add_argument("--preset", action="append", default=[], metavar="NAME")
             command.add_argument("--seconds", type=float, default=240.0, metavar="S")
-        elif name == "render":
+        elif name in ("render", "skipping"):
             command.add_argument("run", type=Path, metavar="RUN")
         if name == "geometry":
             command.add_argument("--poses", type=int, default=20, metavar="N")
-        if name in ("geometry", "render"):
+        if name in ("geometry", "render", "skipping"):
             command.add_argument("--capture", type=Path, metavar="DIR")
         command.add_argument("--only", action="append", default=[], metavar="OPERATION")
         command.add_argument("--quick", action="store_true", help="tiny problems: does it run?")
@@ -50,6 +51,9 @@ def parser() -> argparse.ArgumentParser:
     show = commands.add_parser("show", help="print a report again")
     show.add_argument("report", type=Path, metavar="REPORT.json")
     show.add_argument("--markdown", action="store_true")
+    publish = commands.add_parser("publish", help="write reports into a page, in place")
+    publish.add_argument("reports", type=Path, nargs="+", metavar="REPORT.json")
+    publish.add_argument("--into", type=Path, default=Path("docs/benchmarks.md"), metavar="PAGE")
     return root
 
 
@@ -72,6 +76,10 @@ def _run(arguments: argparse.Namespace) -> None:
         from .results import read_report
 
         print_changes(read_report(arguments.a), read_report(arguments.b))
+    elif arguments.command == "publish":
+        from .publish import publish
+
+        print(", ".join(publish(arguments.reports, arguments.into)))
     elif arguments.command == "show":
         from .results import read_report
         from .show import markdown, print_report
@@ -110,10 +118,11 @@ def _suite(arguments: argparse.Namespace) -> None:
 
         report, plots = run_training(settings)
     else:
-        from . import fields, geometry, render, scaling
+        from . import fields, geometry, render, scaling, skipping
         from .suite import run_suite
 
-        rooms = {"geometry": geometry, "fields": fields, "render": render, "scaling": scaling}
+        rooms = {"geometry": geometry, "fields": fields, "render": render}
+        rooms |= {"scaling": scaling, "skipping": skipping}
         operations = rooms[arguments.command].operations()
         report = run_suite(
             arguments.command, operations, settings, lambda r: save_report(r, arguments.out)

@@ -1,5 +1,6 @@
 """``monopart-bench fields``: hash grid, networks, compositing against eager and compiled torch."""
 
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +17,8 @@ from .registry import Method, Operation, Problem, Settings
 from .skinning_methods import no_compiler
 
 POINTS = 32_768
-LEVELS = GridSpec(levels=16, features=2, log2_size=19, base=16, growth=1.38)
+GRIDS = {rows: GridSpec(16, 2, rows, base=16, growth=1.38) for rows in (16, 19)}
+"""Sixteen levels of at most 2^16 rows (7 MB: caches hold it) and 2^19 (49 MB: they do not)."""
 SMALL = GridSpec(levels=4, features=2, log2_size=10, base=4, growth=1.5)
 PARTS = 5
 
@@ -197,14 +199,12 @@ def judge(case: Case, outcome: Outcome) -> dict[str, float]:
     return figures
 
 
-def _grids(settings: Settings, backward: bool) -> Iterator[Problem]:
+def _grids(settings: Settings, backward: bool, rows: int) -> Iterator[Problem]:
     generator = torch.Generator().manual_seed(5)
-    sizes = (256,) if settings.quick else (POINTS, 262_144)
-    grid = HashGrid([SMALL if settings.quick else LEVELS], generator)
-    for count in sizes:
+    grid = HashGrid([SMALL if settings.quick else GRIDS[rows]], generator)
+    for count in (256,) if settings.quick else (POINTS, 262_144):
         points = torch.rand(count, 3, generator=generator)
-        case = Case(_Grid(grid), (points,), grid.table, backward)
-        yield Problem(count, "uniform", case)
+        yield Problem(count, "uniform", Case(_Grid(grid), (points,), grid.table, backward))
 
 
 def _volumes(settings: Settings, backward: bool) -> Iterator[Problem]:
@@ -242,7 +242,14 @@ _RELATIVE = "largest error relative to the largest value (float64 oracle)"
 def operations() -> tuple[Operation, ...]:
     """All operations of the fields suite."""
     kinds = (
-        ("grid", "Hash grid, 16 levels × 2", _grids, kernel_methods()),
+        (
+            *("grid", "Hash grid, 16 levels × 2, 2^16 rows a level"),
+            *(functools.partial(_grids, rows=16), kernel_methods()),
+        ),
+        (
+            *("grid_large", "Hash grid, 16 levels × 2, 2^19 rows a level"),
+            *(functools.partial(_grids, rows=19), kernel_methods()),
+        ),
         ("composite", "Compositing", _volumes, kernel_methods("dense")),
         ("mlp", "One network 32-64-64-16 per part", _networks, network_methods()),
     )

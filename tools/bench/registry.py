@@ -47,6 +47,8 @@ class Problem:
     """What the methods read."""
     effort: Effort | None = None
     """How often methods are run, where it is not the settings' own."""
+    thorough: bool = True
+    """Whether methods that are marked as rare run, too."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,8 @@ class Method:
     """Brings an untimed result into the form that the judge expects."""
     needs: Callable[[], str | None] | None = None
     """Another reason for absence, or None."""
+    rare: bool = False
+    """Takes seconds a run: only on problems that ask for it, three of twenty."""
     slow_start: bool = False
     """Takes seconds to prepare: left out of quick runs."""
 

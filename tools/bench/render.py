@@ -38,7 +38,12 @@ def _picture(**options: Any) -> Callable[[Any], Callable[[], Any]]:
     return prepare
 
 
-def _problems(settings: Settings) -> Iterator[Problem]:
+def view_problems(settings: Settings) -> Iterator[Problem]:
+    """Some held-out views of a run.
+
+    Raises:
+        InputError: no run was named.
+    """
     import dataclasses
 
     from monopart.toolkit.avatar import view_of
@@ -93,7 +98,7 @@ def operations() -> tuple[Operation, ...]:
         Operation(
             *("picture", "Rendering one picture, posing the body included"),
             "largest difference in colour from the picture with every ray",
-            *(methods, _problems, _judge),
+            *(methods, view_problems, _judge),
             ("Shares refer to 64 samples for every pixel of the image.",),
         ),
     )

@@ -75,16 +75,20 @@ def print_report(report: Report) -> None:
             console.print(f"note: {note}", markup=False)
 
 
-def markdown(report: Report) -> str:
-    """The tables of a report as Markdown."""
+def machine_line(report: Report) -> str:
+    """Machine, versions and commit of a report, one line of Markdown."""
     facts = report.environment
     versions = facts["packages"] | facts["peers"]
     shown = ", ".join(f"{name} {version}" for name, version in versions.items() if version)
-    out = [
+    return (
         f"*{facts['cpu']}, {facts['cores']} cores, {facts['threads']} threads; "
-        f"Python {facts['python']}; {shown}; commit {facts['git_commit'] or 'of the wheel'}.*",
-        "",
-    ]
+        f"Python {facts['python']}; {shown}; commit {facts['git_commit'] or 'of the wheel'}.*"
+    )
+
+
+def markdown(report: Report) -> str:
+    """The tables of a report as Markdown."""
+    out = [machine_line(report), ""]
     for table in report.tables:
         out += [f"### {table.title}", "", f"Error: {table.error}.", ""]
         out += ["| " + " | ".join(HEAD) + " |", "|" + "---|" * len(HEAD)]

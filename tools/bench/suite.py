@@ -105,7 +105,8 @@ def _rows(
     calls: dict[str, Callable[[], Any]] = {}
     used: dict[str, Method] = {}
     for method in methods:
-        if method.name in absent or (method.largest or problem.size) < problem.size:
+        too_large = (method.largest or problem.size) < problem.size
+        if method.name in absent or too_large or (method.rare and not problem.thorough):
             continue
         try:
             call = method.prepare(problem.data)

@@ -245,8 +245,8 @@ def surface_methods(moving: bool = False) -> tuple[Method, ...]:
             wrap(Trimesh),
             ("trimesh", "rtree"),
             "pip install trimesh rtree",
-            False,
-            small,
+            largest=small,
+            rare=True,
         ),
         Method(
             *("fcpw", wrap(Fcpw), ("fcpw",), "pip install fcpw"),

@@ -2,6 +2,7 @@
 
 import importlib.util
 import inspect
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,8 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from monopart.geometry.skinning_field import SkinningField
+from monopart.geometry.surface import SurfaceHit
+
 from .bodies import SurfaceData, barycentrics, closest_exact
 from .registry import Method, load
+from .warp_plain import PlainMesh
 
 _MODULE = "monopart.geometry.unskin"
 STARTS = 13
@@ -31,10 +36,54 @@ def _needs(parameter: str | None = None) -> Callable[[], str | None]:
     return check
 
 
+class PlainIndex:
+    """Closest surface points by Warp's plain query, in the place of our `SurfaceIndex`."""
+
+    def __init__(self, verts: Tensor, faces: Tensor) -> None:
+        """Build Warp's tree.
+
+        Args:
+            verts: vertices [V, 3], metres.
+            faces: vertex indices [F, 3].
+        """
+        self.verts, self.faces = verts, faces
+        self.mesh = PlainMesh(verts.numpy(), faces.numpy(), verts[:1].numpy())
+
+    def refit(self, verts: Tensor) -> None:
+        """Follow moved vertices."""
+        self.verts = verts
+        self.mesh.update(verts.numpy())
+
+    def query(self, points: Tensor, max_distance: float = math.inf) -> SurfaceHit:
+        """As `SurfaceIndex.query`, without gradients."""
+        face, two = (torch.from_numpy(a) for a in self.mesh.query_points(points.numpy()))
+        bary = torch.cat([two, 1.0 - two.sum(-1, keepdim=True)], -1)
+        face = face.long()
+        point = (bary[..., None] * self.verts[self.faces[face]]).sum(1)
+        distance = (points - point).norm(dim=-1)
+        return SurfaceHit(face, bary, point, distance, distance <= max_distance)
+
+
+def _plain_field(data: SurfaceData) -> SkinningField:
+    """Our forward field on Warp's plain query: Broyden as one writes it without our tree."""
+    field: Any = SkinningField(data.body, data.rest)
+    field.index = PlainIndex(data.rest, data.faces)
+    posed = PlainIndex(data.verts, data.faces)
+
+    def posed_index(verts: Tensor) -> PlainIndex:
+        posed.refit(verts)
+        return posed
+
+    field.posed_index = posed_index
+    return field
+
+
 def _method(name: str, **options: Any) -> Callable[[Any], Callable[[], Any]]:
     def prepare(data: SurfaceData) -> Callable[[], Any]:
         solve = load(_MODULE).inverse_skin
         given = {"method": name, "rest_verts": data.rest} | options
+        if given.pop("plain", False):
+            given["rest_verts"] = _plain_field(data)
         return lambda: solve(data.points, data.posed, data.body, **given)
 
     return prepare
@@ -47,10 +96,23 @@ def unskin_methods() -> tuple[Method, ...]:
         Method("newton (default)", _method("newton"), ours=True, needs=one),
         Method("newton, 1 start", _method("newton", starts=1), ours=True, needs=many),
         Method("newton, 3 starts", _method("newton", starts=3), ours=True, needs=many),
-        Method("broyden, 1 start", _method("broyden", starts=1), needs=many),
-        Method(f"broyden, {STARTS} starts", _method("broyden", starts=STARTS), needs=many),
-        Method("fixed point", _method("fixed_point"), needs=one),
-        Method("closest surface", _method("surface"), needs=one),
+        Method("broyden on Warp's query, 1 start", _method("broyden", plain=True), needs=many),
+        Method(
+            f"broyden on Warp's query, {STARTS} starts",
+            _method("broyden", starts=STARTS, plain=True),
+            needs=many,
+            rare=True,
+        ),
+        Method("broyden on our tree, 1 start", _method("broyden"), ours=True, needs=many),
+        Method(
+            f"broyden on our tree, {STARTS} starts",
+            _method("broyden", starts=STARTS),
+            ours=True,
+            needs=many,
+            rare=True,
+        ),
+        Method("fixed point", _method("fixed_point"), ours=True, needs=one),
+        Method("closest surface", _method("surface"), ours=True, needs=one),
         Method("nearest vertex", _method("nearest"), needs=one),
     )
 

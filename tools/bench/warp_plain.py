@@ -43,6 +43,14 @@ class PlainMesh:
         self.verts.assign(verts)
         self.mesh.refit()
 
+    def query_points(self, points: np.ndarray) -> tuple[Any, Any]:
+        """Faces and the first two barycentrics of other points."""
+        if len(points) != len(self.face):
+            self.face = wp.zeros(len(points), dtype=wp.int32, device="cpu")
+            self.bary = wp.zeros(len(points), dtype=wp.vec2, device="cpu")
+        self.points = wp.array(points, dtype=wp.vec3, device="cpu", copy=False)
+        return self.query()
+
     def query(self) -> tuple[Any, Any]:
         """Faces and the first two barycentrics."""
         wp.launch(
