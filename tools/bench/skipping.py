@@ -70,26 +70,36 @@ def _step(
     return prepare
 
 
-def _batches(settings: Settings) -> Iterator[Problem]:
-    from monopart.toolkit.captures.patches import PixelBatch
+def _trainer(settings: Settings) -> Any:
     from monopart.toolkit.runs import open_run
     from monopart.toolkit.train import Trainer
 
     if settings.run is None:
         raise InputError("skipping: expected a run folder, found none; name one of monopart train")
-    trainer = Trainer(open_run(settings.run, settings.capture))
+    return Trainer(open_run(settings.run, settings.capture))
+
+
+def _near(settings: Settings) -> Iterator[Problem]:
+    """Pixels as training draws them."""
+    trainer, count = _trainer(settings), 16 if settings.quick else RAYS
+    batch = trainer.sampler.random(count, torch.Generator().manual_seed(2))
+    yield Problem(count, "pixels near the person", BatchData(trainer, batch), SLOW)
+
+
+def _anywhere(settings: Settings) -> Iterator[Problem]:
+    """Pixels of whole images, most of them far from the person."""
+    from monopart.toolkit.captures.patches import PixelBatch
+
+    trainer, count = _trainer(settings), 16 if settings.quick else RAYS
     generator = torch.Generator().manual_seed(2)
-    count = 16 if settings.quick else RAYS
-    near = trainer.sampler.random(count, generator)
-    yield Problem(count, "pixels near the person", BatchData(trainer, near), SLOW)
     images, height, width = trainer.sampler.masks.shape
     image = torch.randint(images, (count,), generator=generator).sort().values
     x, y = (torch.randint(n, (count,), generator=generator) for n in (width, height))
     mask = trainer.sampler.masks[image, y, x]
     color = trainer.sampler.images[image, y, x].float() / 255.0 * mask[:, None]
     pixels = torch.stack([x, y], -1).float() + 0.5
-    anywhere = PixelBatch(image, pixels, color, mask)
-    yield Problem(count, "pixels of whole images", BatchData(trainer, anywhere), SLOW)
+    batch = PixelBatch(image, pixels, color, mask)
+    yield Problem(count, "pixels of whole images", BatchData(trainer, batch), SLOW)
 
 
 def _judge_step(data: BatchData, out: Any) -> dict[str, float]:
@@ -140,24 +150,32 @@ def operations() -> tuple[Operation, ...]:
             lambda data, figures: figures,
             ("Percent of 64 samples for every pixel of the image; the time is of counting.",),
         ),
-        Operation(
-            *("step", "Training step, forward and backward"),
-            "largest difference in colour from the dense renderer",
-            (
-                Method("all skipping (learned occupancy too)", _step(_same, True), ours=True),
-                Method("exact skipping only", _step(_same), ours=True),
-                Method("no voxels: parts searched at all samples of the box", _step(_unculled)),
-                Method("nothing skipped: all parts' networks at all samples", _step(_everything)),
-            ),
-            _batches,
-            _judge_step,
-            (
-                "Nothing skipped: the same lattice of samples through the box of the body, every "
-                "part evaluated at every sample; its colours differ, for no part ends at its "
-                "radius.",
-            ),
+        *(
+            Operation(
+                *(name, f"Training step, forward and backward, {where}"),
+                "largest difference in colour from the dense renderer",
+                (
+                    Method("all skipping (learned occupancy too)", _step(_same, True), ours=True),
+                    Method("exact skipping only", _step(_same), ours=True),
+                    Method("parts searched at all samples of the box", _step(_unculled)),
+                    Method("nothing skipped: all networks at all samples", _step(_everything)),
+                ),
+                problems,
+                _judge_step,
+                (_NOTE,),
+            )
+            for name, where, problems in (
+                ("step", "pixels near the person, as in training", _near),
+                ("step_whole", "pixels of whole images", _anywhere),
+            )
         ),
     )
+
+
+_NOTE = (
+    "Nothing skipped: the same lattice of samples through the box of the body, every part "
+    "evaluated at every sample; its colours differ, for no part ends at its radius."
+)
 
 
 def _same(parts: Any) -> Any:
