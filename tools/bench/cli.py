@@ -51,6 +51,8 @@ def parser() -> argparse.ArgumentParser:
     show = commands.add_parser("show", help="print a report again")
     show.add_argument("report", type=Path, metavar="REPORT.json")
     show.add_argument("--markdown", action="store_true")
+    cuda = commands.add_parser("cuda-sources", help="compile all kernels for CUDA, without a GPU")
+    cuda.add_argument("--arch", type=int, action="append", default=[], metavar="SM")
     publish = commands.add_parser("publish", help="write reports into a page, in place")
     publish.add_argument("reports", type=Path, nargs="+", metavar="REPORT.json")
     publish.add_argument("--into", type=Path, default=Path("docs/benchmarks.md"), metavar="PAGE")
@@ -76,6 +78,10 @@ def _run(arguments: argparse.Namespace) -> None:
         from .results import read_report
 
         print_changes(read_report(arguments.a), read_report(arguments.b))
+    elif arguments.command == "cuda-sources":
+        from .cuda_sources import print_compiled
+
+        print_compiled(tuple(arguments.arch) or (75, 80, 90))
     elif arguments.command == "publish":
         from .publish import publish
 
