@@ -12,6 +12,7 @@ from monopart.geometry.cameras import Rays
 from monopart.geometry.posed_parts import PosedParts
 
 from .model import AvatarModel, FrameInput, distance
+from .skipping import EVERY, Skipping
 
 SPENT = 5e-5  # light left below which a ray stops: the largest change of a colour
 ROUNDS = (0, 7, 11, 15, 20, 28, 40, 1 << 30)  # samples of a ray after which the light is checked
@@ -36,7 +37,12 @@ class Marched:
 
 @torch.no_grad()
 def march(
-    model: AvatarModel, bodies: PosedParts, frames: FrameInput, rays: Rays, prune: float = 0.0
+    model: AvatarModel,
+    bodies: PosedParts,
+    frames: FrameInput,
+    rays: Rays,
+    prune: float = 0.0,
+    skip: Skipping = EVERY,
 ) -> Marched:
     """Colours of the rays of one body, without what lies behind an opaque front.
 
@@ -46,6 +52,7 @@ def march(
         frames: its time and code.
         rays: [R] rays in that frame.
         prune: see :meth:`AvatarModel.shade`.
+        skip: see :meth:`AvatarModel.shade`.
     """
     step = model.config.geometry.step
     samples = bodies.shell.sample(rays, step)
@@ -62,7 +69,7 @@ def march(
         if not bool(keep.any()):
             break  # no ray has light and samples left
         part = samples.rows(keep)
-        shaded = model.shade(bodies, frames, part, prune)
+        shaded = model.shade(bodies, frames, part, prune, skip)
         delta = torch.full_like(part.depth, step)
         out = composite(shaded.sigma, shaded.color, delta, part.ray_start, part.depth)
         color += light[:, None] * out.color
