@@ -39,7 +39,7 @@ class StepKind:
 
 @dataclass(frozen=True)
 class Timed:
-    """Medians over the timed steps, milliseconds."""
+    """Means over the timed steps, milliseconds: so the stages add up to the step."""
 
     wall: float
     cpu: float
@@ -102,6 +102,15 @@ class StageRow:
     mean_wall: float
     mean_cpu: float | None
     share: float
+
+
+def plain(name: str) -> str:
+    """A kernel's own name, without that of the function which made it.
+
+    >>> plain("forward_kernel__locals__hash_grid_forward")
+    'hash_grid_forward'
+    """
+    return name.rpartition("__locals__")[2]
 
 
 def twin_of(trainer: Trainer) -> Trainer:
@@ -193,7 +202,9 @@ def _traced_step(trainer: Trainer, step: tuple[int, float]) -> tuple[dict[str, f
     spans = recorder.spans
     whole = next(s for s in spans if s.name == STEP)
     events = [
-        Event(s.name, s.kind, s.thread, (s.start - whole.start) / 1e3, (s.end - s.start) / 1e3)
+        Event(
+            plain(s.name), s.kind, s.thread, (s.start - whole.start) / 1e3, (s.end - s.start) / 1e3
+        )
         for s in spans
     ]
     seen = found.function_events or []
@@ -238,19 +249,19 @@ def _backward_shares(
 def _summed(
     kind: StepKind, steps: Sequence[Sequence[Span]], traced: tuple[dict[str, float], list[Event]]
 ) -> KindProfile:
-    """Medians over steps."""
+    """Means over steps."""
     sums: dict[tuple[str, str], list[Counter[str]]] = {}
     for index, spans in enumerate(steps):
         for span in sorted(spans, key=lambda s: s.start):
-            key = (span.kind, span.name)
+            key = (span.kind, plain(span.name))
             per_step = sums.setdefault(key, [Counter() for _ in steps])[index]
             per_step.update(wall=span.end - span.start, cpu=span.cpu)
 
-    def median(values: Sequence[Counter[str]]) -> Timed:
-        wall, cpu = (statistics.median(v[name] for v in values) / 1e6 for name in ("wall", "cpu"))
+    def mean(values: Sequence[Counter[str]]) -> Timed:
+        wall, cpu = (statistics.fmean(v[name] for v in values) / 1e6 for name in ("wall", "cpu"))
         return Timed(wall, cpu)
 
-    found = {key: median(values) for key, values in sums.items()}
+    found = {key: mean(values) for key, values in sums.items()}
     total = found.pop(("stage", STEP))
     stages = {name: timed for (what, name), timed in found.items() if what == "stage"}
     rest = Timed(
