@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from .rotations import rotation_angle as rotation_angle
     from .rotations import rotmat_to_axis_angle as rotmat_to_axis_angle
     from .rotations import rotmat_to_quat_wxyz as rotmat_to_quat_wxyz
+    from .skinning import SkinWeights as SkinWeights
+    from .skinning import blend_skin as blend_skin
     from .skinning import blend_transforms as blend_transforms
     from .skinning import skin as skin
     from .surface import SurfaceHit as SurfaceHit
@@ -73,11 +75,13 @@ _ROOM = {
     "Rays": "cameras",
     "RestPoints": "posed_parts",
     "ShellSamples": "culling",
+    "SkinWeights": "skinning",
     "SurfaceHit": "surface",
     "SurfaceIndex": "surface",
     "UVMap": "uv",
     "Unskinned": "unskin",
     "axis_angle_to_rotmat": "rotations",
+    "blend_skin": "skinning",
     "blend_transforms": "skinning",
     "box_mask": "boxes",
     "box_of": "boxes",

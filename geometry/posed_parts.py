@@ -16,6 +16,7 @@ from torch import Tensor
 from .body import BodyModel, PosedBody
 from .culling import BodyShell, ShellSamples
 from .errors import InputError
+from .face_tree import FaceTrees
 from .parts import PartMap
 from .rigid import append_last_row, invert_affine, transform_points
 from .skinning import blend_transforms
@@ -87,6 +88,7 @@ class PosedParts:
         canonical: PosedBody,
         parts: PartMap,
         radius: float | Float[Tensor, "k"] = 0.05,
+        shell: BodyShell | None = None,
     ) -> None:
         """Build shells, search trees and blended maps.
 
@@ -96,9 +98,10 @@ class PosedParts:
             canonical: one body in the canonical pose.
             parts: the part of each joint.
             radius: metres; a point farther than this from a part's surface does not belong to it.
+            shell: the shell of these bodies where a caller has one, of the same radius and parts.
 
         Raises:
-            InputError: the body has no UVs.
+            InputError: the body has no UVs, or the shell is of another number of bodies.
         """
         if body.uv is None:
             raise InputError("body: expected UV coordinates, found none; unwrap the body first")
@@ -109,31 +112,21 @@ class PosedParts:
         self.num_parts = len(parts.names)
         radii = torch.as_tensor(radius, dtype=torch.float32, device=verts.device)
         self.radius = radii.expand(self.num_parts).contiguous()
-        self.shell = BodyShell(verts, self.faces, self.radius, self.face_part)
+        self.shell = shell or BodyShell(verts, self.faces, self.radius, self.face_part)
+        if len(self.shell.lo) != len(verts):
+            raise InputError(
+                f"shell: expected {len(verts)} bodies, found {len(self.shell.lo)}; build it from "
+                "the vertices of these bodies"
+            )
         self.corner_uv = body.uv.corner_uv.to(verts).contiguous()
         weights = body.weights.to(verts)
         flat = posed.transforms.detach().reshape(-1, body.num_joints, 4, 4).to(verts)
         self.posed_maps = _rows(blend_transforms(flat, weights))
         self.canonical_maps = _rows(blend_transforms(canonical.transforms.to(verts), weights))
         self._faces32 = self.faces.int().contiguous()
-        self._build_trees()
-
-    def _build_trees(self) -> None:
-        from .kernels.closest import mesh
-        from .kernels.launch import init
-
-        init()
-        order = torch.argsort(self.face_part, stable=True)
-        counts = torch.bincount(self.face_part, minlength=self.num_parts)
-        self._order = order
-        self._first = counts.cumsum(0) - counts
-        slices = self._faces32[order].split(counts.tolist())
-        self._trees = [
-            [mesh(verts, tris.contiguous()) if len(tris) else None for tris in slices]
-            for verts in self.verts
-        ]
-        ids = [[tree.id if tree is not None else 0 for tree in row] for row in self._trees]
-        self._ids = torch.tensor(ids, dtype=torch.int64, device=self.device)
+        self.trees = FaceTrees(
+            verts, self.faces, self.face_part, self.num_parts, canonical.verts.to(verts)
+        )
 
     def unculled(self) -> "PosedParts":
         """The same bodies without voxel culling, for comparison: slower, the same pairs."""
@@ -144,15 +137,16 @@ class PosedParts:
     def _search(
         self, points: Tensor, body: Tensor, candidates: Tensor, radius: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Per part and point: face within that part's own mesh (-1: none) and two barycentrics."""
+        """Per part and point: closest face within the part's radius (-1: none), barycentrics."""
         from .kernels.closest import closest_on_parts
         from .kernels.launch import launch, view
 
         count = points.shape[0]
-        face = torch.zeros(self.num_parts, count, dtype=torch.int32, device=self.device)
-        bary = torch.zeros(self.num_parts, count, 2, device=self.device)
-        args = [view(self._ids), view(points, 3), view(body), view(candidates), view(radius)]
-        launch(closest_on_parts, count, [*args, view(face), view(bary, 2)], points)
+        face = torch.empty(self.num_parts, count, dtype=torch.int32, device=self.device)
+        bary = torch.empty(self.num_parts, count, 2, device=self.device)
+        args = [*self.trees.args(), view(self.verts, 3), view(self._faces32, 3), view(points, 3)]
+        args += [view(body), view(candidates), view(radius), view(face), view(bary, 2)]
+        launch(closest_on_parts, count, args, points)
         return face, bary
 
     def pairs(self, samples: ShellSamples) -> PartPairs:
@@ -166,8 +160,8 @@ class PosedParts:
         """
         face, bary = self._search(samples.points, samples.body, samples.candidates, self.radius)
         part, sample = torch.nonzero(face >= 0, as_tuple=True)
-        found = self._order[self._first[part] + face[part, sample].long()]
         counts = torch.bincount(part, minlength=self.num_parts).tolist()
+        found = face[part, sample].long()
         return PartPairs(sample, part, found, bary[part, sample], tuple(counts))
 
     def unskin(self, samples: ShellSamples, pairs: PartPairs) -> RestPoints:
@@ -210,9 +204,9 @@ class PosedParts:
         radius = torch.full_like(self.radius, reach)
         face, bary = self._search(queries, body, (1 << part).int(), radius)
         rows = torch.arange(count, device=self.device)
-        local = face[part, rows]
-        found = local >= 0
-        index = self._order[(self._first[part] + local) * found]
+        index = face[part, rows].long()
+        found = index >= 0
+        index = index * found
         two = bary[part, rows]
         full = torch.cat([two, 1.0 - two.sum(-1, keepdim=True)], -1)
         uv = (full[..., None] * self.corner_uv[index]).sum(-2)

@@ -7,7 +7,6 @@ So x(p) = A(w(p)) p, A(w) = sum of w_j T_j, has the Jacobian A(w) + sum over cor
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -16,9 +15,6 @@ from torch import Tensor
 from .body import BodyModel
 from .errors import InputError
 from .surface import SurfaceIndex, closest_on_triangle
-
-# lists of the possible closest faces near the rest surface: metres, metres, faces per voxel
-_VOXEL, _REACH, _LISTED = 0.015, 0.06, 64
 
 
 @dataclass(frozen=True)
@@ -167,7 +163,13 @@ class SkinningField:
         self.index = SurfaceIndex(rest.detach(), self.faces, backend)
         self.backend = self.index.backend
         self._posed: SurfaceIndex | None = None
-        self._lists: dict[str, Any] | None = None
+        self.faces32 = self.faces.int().contiguous()
+        self.weights32 = self.weights.float().contiguous()
+        # a face at each vertex, -1 for a vertex that no face uses
+        self.some_face = torch.full((len(rest),), -1, dtype=torch.int32, device=rest.device)
+        number = torch.arange(len(self.faces), dtype=torch.int32, device=rest.device)
+        for corner in range(3):
+            self.some_face[self.faces[:, corner]] = number
 
     def weights_at(
         self, points: Float[Tensor, "n 3"], max_distance: float = math.inf
@@ -189,68 +191,3 @@ class SkinningField:
         else:
             self._posed.refit(verts)
         return self._posed
-
-    def near_lists(self) -> dict[str, Any]:
-        """Per voxel near the rest surface its possible closest faces, built once in about 1 s."""
-        if self._lists is None:
-            self._lists = _build_lists(self)
-        return self._lists
-
-
-def mesh_id(index: SurfaceIndex) -> Any:
-    """Warp's handle of the mesh of an index.
-
-    Args:
-        index: with the warp back end.
-
-    Returns:
-        A launch argument.
-    """
-    return index._mesh.id  # type: ignore[union-attr]
-
-
-def _build_lists(field: SkinningField) -> dict[str, Any]:
-    from .kernels.launch import launch, view
-    from .kernels.near_faces import list_faces, mark_near
-
-    rest = field.rest.detach().float()
-    tris = rest[field.faces].contiguous()
-    low, high = rest.amin(0) - _REACH, rest.amax(0) + _REACH
-    # a shape far larger than a person gets larger voxels, not more of them
-    voxel = max(_VOXEL, float((high - low).prod()) ** (1 / 3) / 160)
-    reach = _REACH * voxel / _VOXEL
-    low, high = rest.amin(0) - reach, rest.amax(0) + reach
-    lo = tuple(low.tolist())
-    dims = tuple(((high - low) / voxel).ceil().int().tolist())
-    count = math.prod(dims)
-    near = torch.zeros(count, dtype=torch.bool, device=rest.device)
-    mesh = mesh_id(field.index)
-    launch(mark_near, count, [mesh, lo, dims, voxel, reach, view(near)], rest)
-    cells = near.nonzero().squeeze(-1)
-    slots = torch.full((count,), -1, dtype=torch.int32, device=rest.device)
-    slots[cells] = torch.arange(len(cells), dtype=torch.int32, device=rest.device)
-    entries = torch.full((len(cells), _LISTED, 2), -1.0, device=rest.device)
-    cells = cells.int()
-    args = [mesh, view(tris, 3), view(cells), lo, dims, voxel, view(entries, 2)]
-    launch(list_faces, len(cells), args, rest)
-    return {
-        "tris": tris,
-        "discs": _discs(tris),
-        "faces": field.faces.int().contiguous(),
-        "weights": field.weights.float().contiguous(),
-        "lo": lo,
-        "dims": dims,
-        "voxel": voxel,
-        "slots": slots,
-        "near": entries,
-    }
-
-
-def _discs(tris: Tensor) -> Tensor:
-    """Per face a disc that holds it, [F, 2, 4]: centre and radius, then the unit normal."""
-    centre = tris.mean(1)
-    radius = (tris - centre[:, None]).norm(dim=-1).amax(1) * (1 + 1e-4) + 1e-6
-    normal = torch.linalg.cross(tris[:, 1] - tris[:, 0], tris[:, 2] - tris[:, 0])
-    normal = torch.nn.functional.normalize(normal, dim=-1, eps=1e-30)
-    disc = torch.cat([centre, radius[:, None]], -1)
-    return torch.stack([disc, torch.nn.functional.pad(normal, (0, 1))], 1).contiguous()

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .errors import BackendError, InputError
+from .face_tree import LIMIT, FaceTrees
 from .norms import safe_norm
 
 _CHUNK = 1 << 22  # (point, face) pairs of one step of the reference
@@ -95,7 +96,7 @@ def closest_on_triangle(
     return torch.where(inside[..., None], face_bary, edge_bary)
 
 
-def _check(points: Tensor, verts: Tensor, faces: Tensor) -> None:
+def _check_faces(verts: Tensor, faces: Tensor) -> None:
     if faces.shape[0] == 0:
         raise InputError("faces: expected at least one triangle, found 0; pass a mesh with faces")
     if int(faces.min()) < 0 or int(faces.max()) >= verts.shape[0]:
@@ -103,6 +104,9 @@ def _check(points: Tensor, verts: Tensor, faces: Tensor) -> None:
             f"faces: expected indices in 0..{verts.shape[0] - 1}, found {int(faces.min())}.."
             f"{int(faces.max())}; use the faces that belong to these vertices"
         )
+
+
+def _check_like(points: Tensor, verts: Tensor) -> None:
     if points.dtype != verts.dtype or points.device != verts.device:
         raise InputError(
             f"points: expected dtype and device of verts ({verts.dtype}, {verts.device}), found "
@@ -162,37 +166,33 @@ class SurfaceIndex:
         Args:
             verts: vertices, metres.
             faces: vertex indices.
-            backend: "warp" (bounding-volume hierarchy), "torch" (brute force) or "auto" (warp where
-                it is installed). The warp search runs in float32 and passes over faces without
-                area, whose points belong to their neighbours too unless such a face stands alone;
-                distances are evaluated in the dtype of the input.
+            backend: "warp" (a tree of 8-wide nodes), "torch" (brute force) or "auto" (warp where it
+                is installed). The warp search runs in float32; barycentrics, points and distances
+                are evaluated in the dtype of the input.
 
         Raises:
             InputError: faces are empty or out of range, or the backend is unknown.
             BackendError: Warp was asked for by name and is not installed.
         """
         self.backend = _choose_backend(backend)
-        _check(verts, verts, faces)
+        _check_faces(verts, faces)
         self.faces = faces.long()
-        self._mesh = None
-        self._set(verts)
-
-    def _set(self, verts: Tensor) -> None:
         self.verts = verts
-        if self.backend != "warp":
-            return
-        from .kernels.closest import mesh
-        from .kernels.launch import init
+        self._tree: FaceTrees | None = None
+        if self.backend == "warp":
+            self._tree = FaceTrees(verts.detach().float()[None], self.faces)
+            self._corners = self.faces.int().contiguous()
 
-        positions = verts.detach().float().contiguous()
-        if self._mesh is None:
-            init()
-            self._positions = positions.clone()
-            self._indices = self.faces.int().contiguous()
-            self._mesh = mesh(self._positions, self._indices)
-        else:
-            self._positions.copy_(positions)
-            self._mesh.refit()
+    @property
+    def tree(self) -> FaceTrees:
+        """The search tree of the warp back end.
+
+        Raises:
+            BackendError: the back end is torch.
+        """
+        if self._tree is None:
+            raise BackendError("SurfaceIndex.tree: expected backend 'warp', found 'torch'")
+        return self._tree
 
     def refit(self, verts: Float[Tensor, "v 3"]) -> None:
         """Move the vertices and keep the topology; far cheaper than building anew.
@@ -208,7 +208,9 @@ class SurfaceIndex:
                 f"verts: expected {tuple(self.verts.shape)} as built, found {tuple(verts.shape)}; "
                 "build a new SurfaceIndex for another mesh"
             )
-        self._set(verts)
+        self.verts = verts
+        if self._tree is not None:
+            self._tree.refit(verts.detach().float()[None])
 
     def query(self, points: Float[Tensor, "n 3"], max_distance: float = math.inf) -> SurfaceHit:
         """Closest surface point of each query point.
@@ -223,27 +225,49 @@ class SurfaceIndex:
         Raises:
             InputError: dtype or device differ from the vertices'.
         """
-        _check(points, self.verts, self.faces)
-        if self.backend == "torch":
+        _check_like(points, self.verts)
+        if self._tree is None:
             with torch.no_grad():
                 face = _search_torch(points, self.verts, self.faces)
-        else:
-            face = self._search_warp(points, max_distance)
-        return _hit(points, self.verts, self.faces, face, max_distance)
+            return _hit(points, self.verts, self.faces, face, max_distance)
+        wanted = torch.is_grad_enabled() and (points.requires_grad or self.verts.requires_grad)
+        if wanted or points.dtype != torch.float32:
+            face = self._faces_of(self._tree, points, max_distance)
+            return _hit(points, self.verts, self.faces, face, max_distance)
+        return self._hits_of(self._tree, points, max_distance)
 
-    def _search_warp(self, points: Tensor, max_distance: float) -> Tensor:
-        from .kernels.closest import closest_on_mesh
+    def _faces_of(self, tree: FaceTrees, points: Tensor, max_distance: float) -> Tensor:
+        """Closest faces (-1: none), for an evaluation in torch."""
+        from .kernels.face_tree import closest_faces
         from .kernels.launch import launch, view
 
-        count = points.shape[0]
         queries = points.detach().float().contiguous()
-        face = torch.zeros(count, dtype=torch.int32, device=points.device)
-        bary = torch.zeros(count, 2, dtype=torch.float32, device=points.device)
-        # A little slack: the exact limit is applied to the evaluated distance.
-        limit = min(max_distance * (1 + 1e-5) + 1e-7, 1e30)
-        args = [self._mesh.id, view(queries, 3), limit, view(face), view(bary, 2)]  # type: ignore[union-attr]
-        launch(closest_on_mesh, count, args, queries)
+        face = torch.empty(len(queries), dtype=torch.int32, device=points.device)
+        # a little slack: the exact limit is applied to the evaluated distance
+        limit = min(max_distance * (1 + 1e-5) + 1e-7, LIMIT)
+        launch(
+            closest_faces,
+            len(queries),
+            [view(queries, 3), *tree.args(), limit, view(face)],
+            queries,
+        )
         return face
+
+    def _hits_of(self, tree: FaceTrees, points: Tensor, max_distance: float) -> SurfaceHit:
+        """Search and evaluation in one kernel, without gradients."""
+        from .kernels.face_tree import closest_hits
+        from .kernels.launch import launch, view
+
+        count, device = len(points), points.device
+        queries, verts = points.detach().contiguous(), self.verts.detach().contiguous()
+        face = torch.empty(count, dtype=torch.int64, device=device)
+        bary, point = torch.empty(2, count, 3, device=device).unbind(0)
+        distance = torch.empty(count, device=device)
+        found = torch.empty(count, dtype=torch.bool, device=device)
+        args = [view(queries, 3), view(verts, 3), view(self._corners), *tree.args()]
+        args += [min(max_distance, LIMIT), view(face), view(bary, 3), view(point, 3)]
+        launch(closest_hits, count, [*args, view(distance), view(found)], queries)
+        return SurfaceHit(face, bary, point, distance, found)
 
 
 def closest_point(

@@ -7,13 +7,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from .face_tree import LIMIT
 from .rigid import apply_linear, invert_affine, invert_linear
-from .skinning_field import SkinningField, field_at, field_jacobian, mesh_id
+from .skinning_field import SkinningField, field_at, field_jacobian
 
 MIN_DET = 1e-2  # a map with a smaller |determinant| has no inverse worth having
 ARRIVED = 1e-3  # metres: a residual up to this counts as a root
 LONGEST_STEP = 0.2  # metres: a Newton step of a nearly singular Jacobian is cut to this
-_GRID, _SPLAT = 72, 2.5  # first-guess grid of a pose: voxels per side, reach in voxels
+_GRID, _SPLAT = 64, 1.8  # first-guess grid of a pose: voxels per side, reach in voxels
+_ORDER, _MARGIN = 64, 0.1  # cells per side and margin (metres) by which points are ordered
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def guess_warp(
     points: Float[Tensor, "n 3"],
     maps: Float[Tensor, "V 3 4"],
     max_distance: float,
-) -> Float[Tensor, "n 3"]:
+) -> tuple[Float[Tensor, "n 3"], Int[Tensor, "n"]]:
     """First guesses: the inverse map of the posed vertex that the voxel of a point names.
 
     Args:
@@ -94,15 +96,15 @@ def guess_warp(
 
     Returns:
         Rest points; where the voxel is empty, by a corner of the closest posed face, and where that
-        is out of reach too, the point itself.
+        is out of reach too, the point itself. And a face near each, -1 where there is none.
     """
     from .kernels.launch import launch, launch_one, view
-    from .kernels.newton import EMPTY, first_guess, splat_verts
+    from .kernels.newton import EMPTY, first_guess, skin_verts, splat_verts
 
     rest = field.rest.detach().contiguous()
-    skinned = ((maps[..., :3] * rest[:, None, :]).sum(-1) + maps[..., 3]).contiguous()
-    inverse, _ = invert_linear(maps[..., :3], MIN_DET)
-    inverse = inverse.contiguous()
+    skinned, inverse = torch.empty_like(rest), torch.empty(len(rest), 3, 3, device=rest.device)
+    args = [view(rest, 3), view(maps, 4), MIN_DET, view(skinned, 3), view(inverse, 3)]
+    launch(skin_verts, len(rest), args, points)
     low, high = skinned.amin(0), skinned.amax(0)
     # corner and voxel size stay on the device; the reach is kept free around the body
     border = math.ceil(_SPLAT)
@@ -112,20 +114,21 @@ def guess_warp(
     args = [view(skinned, 3), view(frame), _GRID, _SPLAT, view(nearest)]
     launch_one(splat_verts, len(skinned), args, points)
     posed = field.posed_index(skinned)
-    faces = field.near_lists()["faces"]
-    guess = torch.zeros_like(points)
-    args = [view(points, 3), view(frame), _GRID, view(nearest), mesh_id(posed), view(faces, 3)]
-    args += [min(2 * max_distance, 1e10), view(rest, 3), view(skinned, 3), view(inverse, 3)]
-    launch(first_guess, len(points), [*args, view(guess, 3)], points)
-    return guess
+    guess = torch.empty_like(points)
+    hint = torch.empty(len(points), dtype=torch.int32, device=points.device)
+    args = [view(points, 3), view(frame), _GRID, view(nearest), *posed.tree.args()]
+    args += [view(field.faces32, 3), min(2 * max_distance, LIMIT), view(rest, 3), view(skinned, 3)]
+    args += [view(inverse, 3), view(field.some_face), view(guess, 3), view(hint)]
+    launch(first_guess, len(points), args, points)
+    return guess, hint
 
 
-def _by_voxel(points: Tensor, lo: tuple, dims: tuple, voxel: float) -> Tensor:
+def _by_voxel(points: Tensor, rest: Tensor) -> Tensor:
     """Order in which neighbours follow each other: the look-ups then hit warm memory."""
-    corner = torch.tensor(lo, dtype=points.dtype, device=points.device)
-    limit = torch.tensor(dims, dtype=torch.int32, device=points.device)
-    cell = ((points - corner) / voxel).clamp(0, 1e6).int().minimum(limit - 1)
-    return ((cell[:, 2] * limit[1] + cell[:, 1]) * limit[0] + cell[:, 0]).argsort()
+    low = rest.amin(0) - _MARGIN
+    voxel = ((rest.amax(0) + _MARGIN - low) / _ORDER).clamp(min=1e-6)
+    cell = ((points - low) / voxel).clamp(0, _ORDER - 1).int()
+    return ((cell[:, 2] * _ORDER + cell[:, 1]) * _ORDER + cell[:, 0]).argsort()
 
 
 def newton_warp(
@@ -154,25 +157,21 @@ def newton_warp(
 
     points, maps = points.contiguous(), maps.contiguous()
     if guess is None:
-        guess = guess_warp(field, points, maps, plan.max_distance)
-    count, device, lists = len(points), points.device, field.near_lists()
-    rest = torch.zeros_like(points)
-    weights = torch.zeros(count, field.weights.shape[1], device=device)
-    face = torch.zeros(count, dtype=torch.int32, device=device)
-    residual = torch.zeros(count, device=device)
-    invertible = torch.zeros(count, dtype=torch.bool, device=device)
-    limits = (plan.stop, ARRIVED, MIN_DET, min(plan.max_distance, 1e10))
-    order = _by_voxel(guess, lists["lo"], lists["dims"], lists["voxel"])
-    args = [
-        view(order),
-        view(points, 3),
-        view(guess, 3),
-        mesh_id(field.index),
-        view(lists["tris"], 3),
-    ]
-    args += [view(lists["discs"], 4), view(lists["faces"], 3), lists["lo"], lists["dims"]]
-    args += [lists["voxel"], view(lists["slots"]), view(lists["near"], 2)]
-    args += [view(maps, 4), view(lists["weights"]), view(bones.joints, 3), view(bones.inverses, 4)]
+        guess, hint = guess_warp(field, points, maps, plan.max_distance)
+    else:
+        hint = torch.full((len(points),), -1, dtype=torch.int32, device=points.device)
+    count, device = len(points), points.device
+    rest = torch.empty_like(points)
+    weights = torch.empty(count, field.weights.shape[1], device=device)
+    face = torch.empty(count, dtype=torch.int32, device=device)
+    residual = torch.empty(count, device=device)
+    invertible = torch.empty(count, dtype=torch.bool, device=device)
+    limits = (plan.stop, ARRIVED, MIN_DET, min(plan.max_distance, LIMIT))
+    order = _by_voxel(guess, field.rest)
+    args = [view(order), view(points, 3), view(guess, 3), view(hint)]
+    args += [view(field.index.tree.places), *field.index.tree.args()]
+    args += [view(field.rest.detach().contiguous(), 3), view(field.faces32, 3)]
+    args += [view(maps, 4), view(field.weights32), view(bones.joints, 3), view(bones.inverses, 4)]
     args += [plan.starts, plan.iterations, int(plan.gradients), limits]
     out = [view(rest, 3), view(weights), view(face), view(residual), view(invertible)]
     launch(solve, count, [*args, *out], points)

@@ -1,38 +1,24 @@
-"""Warp kernels of the closest surface: one mesh, and the parts of many posed bodies at once."""
+"""Warp kernels of the parts of many posed bodies: closest surface, and the way to rest space."""
 
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import warp as wp
+
+from .face_tree import bary_on_triangle, closest_in_tree
 
 wp.set_module_options({"enable_backward": False})  # gradients are kernels of their own
 
 
 @no_type_check
 @wp.kernel
-def closest_on_mesh(
-    start: int,
-    mesh: wp.uint64,
-    points: wp.array(dtype=wp.vec3),
-    max_distance: float,
-    face: wp.array(dtype=wp.int32),
-    bary: wp.array(dtype=wp.vec2),
-):
-    """Face and first two barycentrics of the closest point; face -1 beyond max_distance."""
-    i = start + wp.tid()
-    query = wp.mesh_query_point_no_sign(mesh, points[i], max_distance)
-    if query.result:
-        face[i] = query.face
-        bary[i] = wp.vec2(query.u, query.v)
-    else:
-        face[i] = -1
-        bary[i] = wp.vec2(0.0, 0.0)
-
-
-@no_type_check
-@wp.kernel
 def closest_on_parts(
     start: int,
-    meshes: wp.array2d(dtype=wp.int64),
+    layout: wp.array2d(dtype=wp.int64),
+    boxes: wp.array2d(dtype=wp.float32),
+    tris: wp.array2d(dtype=wp.float32),
+    slots: wp.array(dtype=wp.int32),
+    verts: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
     points: wp.array(dtype=wp.vec3),
     body: wp.array(dtype=wp.int32),
     candidates: wp.array(dtype=wp.int32),
@@ -40,19 +26,22 @@ def closest_on_parts(
     face: wp.array2d(dtype=wp.int32),
     bary: wp.array2d(dtype=wp.vec2),
 ):
-    """Per sample and candidate part: face of that part's own mesh within its radius, or -1."""
+    """Per sample and candidate part: closest face of that part within its radius, or -1."""
     i = start + wp.tid()
     p = points[i]
     b = body[i]
     mask = candidates[i]
-    for k in range(meshes.shape[1]):
+    for k in range(layout.shape[0]):
         found = int(-1)
         uv = wp.vec2(0.0, 0.0)
-        if (mask >> k) & 1 and meshes[b, k] != wp.int64(0):  # 0: a part without faces
-            query = wp.mesh_query_point_no_sign(wp.uint64(meshes[b, k]), p, radius[k])
-            if query.result:
-                found = query.face
-                uv = wp.vec2(query.u, query.v)
+        if (mask >> k) & 1:
+            found = closest_in_tree(
+                p, layout, boxes, tris, slots, k, wp.int64(b), radius[k] * radius[k]
+            )
+            if found >= 0:
+                tri = faces[found]
+                w = bary_on_triangle(p, verts[b, tri[0]], verts[b, tri[1]], verts[b, tri[2]])
+                uv = wp.vec2(w[0], w[1])
         face[k, i] = found
         bary[k, i] = uv
 
@@ -120,11 +109,3 @@ def unskin_pairs(
     )
     uv[i] = corner_uv[f, 0] * w[0] + corner_uv[f, 1] * w[1] + corner_uv[f, 2] * w[2]
     valid[i] = ok
-
-
-def mesh(points: Any, faces: Any) -> wp.Mesh:
-    """A Warp mesh over torch tensors (vertices V 3 float32, faces F 3 int32), without a copy."""
-    return wp.Mesh(
-        wp.from_torch(points.detach(), dtype=wp.vec3, requires_grad=False),
-        wp.from_torch(faces.reshape(-1), dtype=wp.int32, requires_grad=False),
-    )

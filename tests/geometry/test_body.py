@@ -1,5 +1,6 @@
 """The body against plain float64 loops and against the vertices of the captures."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from monopart.geometry.body import BodyModel, BodyPose, PosedBody, convert_smplx_translation
 from monopart.geometry.body_io import check_body, read_npy_object
-from monopart.geometry.errors import InputError
+from monopart.geometry.errors import BackendError, InputError
 from monopart.geometry.rigid import transform_points
 from monopart.geometry.rotations import axis_angle_to_rotmat
 
@@ -252,3 +253,49 @@ def test_wrong_counts_are_refused(small: BodyModel) -> None:
         small(BodyPose(pose.pose[:4], pose.betas, pose.rotation, pose.translation))
     with pytest.raises(InputError, match=r"betas: expected at most 4 .* found 6"):
         small(BodyPose(pose.pose, torch.zeros(6), pose.rotation, pose.translation))
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (2, 2), (0,)])
+@pytest.mark.parametrize("pose_blend", [True, False])
+def test_kernels_equal_their_twin(batch: tuple[int, ...], pose_blend: bool) -> None:
+    body = body_of(oracles.random_body(2, pose_blend=pose_blend))
+    torch.manual_seed(2)
+    exact = random_pose(body, *batch)
+    results = []
+    for pose, backend in ((exact, "torch"), (exact.to(torch.zeros(1)), "warp")):
+        fields = [t.detach().clone().requires_grad_() for t in vars(pose).values()]
+        posed = body(BodyPose(*fields), backend)
+        found = (posed.verts_world, posed.joints, posed.transforms)
+        total = sum((t * torch.linspace(-1, 1, t.numel()).view_as(t)).sum() for t in found)
+        results.append([*found, *torch.autograd.grad(total, fields)])
+    for want, have in zip(*results, strict=True):
+        assert have.dtype == torch.float32
+        atol = 3e-6 * (1 + float(want.detach().abs().max())) if want.numel() else 0.0
+        torch.testing.assert_close(have, want.float(), atol=atol, rtol=0)
+
+
+def test_a_back_end_by_name_runs_or_raises(small: BodyModel) -> None:
+    pose = random_pose(small)
+    with pytest.raises(BackendError, match="expected float32"):
+        small(pose, "warp")
+    single = pose.to(torch.zeros(1))
+    single.pose.requires_grad_()
+    with pytest.raises(BackendError, match="second derivative"):
+        torch.autograd.grad(small(single).verts.sum(), single.pose, create_graph=True)
+    verts = small(single, "torch").verts
+    (first,) = torch.autograd.grad(verts.square().sum(), single.pose, create_graph=True)
+    (second,) = torch.autograd.grad(first.square().sum(), single.pose)
+    assert second.isfinite().all() and second.any()
+
+
+def test_shape_directions_that_are_fitted_receive_a_gradient(small: BodyModel) -> None:
+    fitted = dataclasses.replace(small, shapedirs=small.shapedirs.clone().requires_grad_())
+    betas = torch.randn(2, 3)
+    with torch.no_grad():
+        expected = small.shaped(betas)[0]
+        torch.testing.assert_close(fitted.shaped(betas)[0], expected)
+    verts = fitted.shaped(betas)[0]
+    verts.sum().backward()
+    assert fitted.shapedirs.grad is not None
+    rows = betas.sum(0).expand(small.num_verts, 3, 3)
+    torch.testing.assert_close(fitted.shapedirs.grad[..., :3], rows)

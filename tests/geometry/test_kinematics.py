@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from monopart.geometry.errors import InputError
+from monopart.geometry.errors import BackendError, InputError
 from monopart.geometry.kinematics import KinematicTree, forward_kinematics
 from monopart.geometry.rigid import transform_points
 from monopart.geometry.rotations import axis_angle_to_rotmat
@@ -117,3 +117,69 @@ def test_wrong_number_of_joints_is_refused() -> None:
     rotmats, joints = random_pose(num_joints=7)
     with pytest.raises(InputError, match=r"expected 8 joints .* found 7"):
         forward_kinematics(KinematicTree(PARENTS), rotmats, joints)
+
+
+# --- the kernels ----------------------------------------------------------------------------------
+
+
+def chain_and_gradients(
+    parents: tuple[int, ...], rotmats: torch.Tensor, joints: torch.Tensor, backend: str
+) -> list[torch.Tensor]:
+    rotmats, joints = (t.detach().clone().requires_grad_() for t in (rotmats, joints))
+    transforms = forward_kinematics(KinematicTree(parents), rotmats, joints, backend)
+    pull = torch.linspace(-1, 1, transforms.numel(), dtype=joints.dtype).view_as(transforms)
+    gradients = torch.autograd.grad((pull * transforms).sum(), (rotmats, joints))
+    return [transforms.detach(), *gradients]
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (2,), (2, 3), (0,)])
+@pytest.mark.parametrize("parents", [(-1,), (-1, 0), PARENTS, tuple(range(-1, 9))])
+def test_kernels_equal_their_twin(batch: tuple[int, ...], parents: tuple[int, ...]) -> None:
+    torch.manual_seed(5)
+    rotmats, joints = random_pose(*batch, num_joints=len(parents))
+    exact = chain_and_gradients(parents, rotmats, joints, "torch")
+    single = (rotmats.float(), joints.float())
+    found = chain_and_gradients(parents, *single, "warp")
+    automatic = chain_and_gradients(parents, *single, "auto")
+    for have, same, want in zip(found, automatic, exact, strict=True):
+        assert have.dtype == torch.float32 and torch.equal(have, same)
+        torch.testing.assert_close(have, want.float(), atol=1e-5, rtol=2e-6)
+
+
+@pytest.mark.parametrize("backend", ["warp", "torch"])
+def test_one_rest_pose_serves_many_rotations(backend: str) -> None:
+    rotmats, joints = (t.float() for t in random_pose(3))
+    whole = chain_and_gradients(PARENTS, rotmats, joints[:1].expand(3, 8, 3), backend)
+    found = chain_and_gradients(PARENTS, rotmats, joints[0], backend)
+    whole[2] = whole[2].sum(0)
+    torch.testing.assert_close(found, whole)
+
+
+def test_kernels_give_the_same_bits_on_any_number_of_threads() -> None:
+    rotmats, joints = (t.float() for t in random_pose(1500))
+    before = torch.get_num_threads()
+    runs = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        try:
+            runs.append(chain_and_gradients(PARENTS, rotmats, joints, "warp"))
+        finally:
+            torch.set_num_threads(before)
+    for other in runs[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(runs[0], other, strict=True))
+
+
+def test_what_the_kernels_cannot_do() -> None:
+    rotmats, joints = random_pose(2)
+    with pytest.raises(BackendError, match="expected float32"):
+        forward_kinematics(KinematicTree(PARENTS), rotmats, joints, "warp")
+    joints = joints.float().requires_grad_()
+    transforms = forward_kinematics(KinematicTree(PARENTS), rotmats.float(), joints, "warp")
+    with pytest.raises(BackendError, match=r"second derivative .*backend='torch'"):
+        torch.autograd.grad(transforms.sum(), joints, create_graph=True)
+
+
+def test_joints_that_do_not_fit_the_rotations_are_refused() -> None:
+    rotmats, joints = random_pose(2)
+    with pytest.raises(InputError, match=r"joints: expected torch\.float64"):
+        forward_kinematics(KinematicTree(PARENTS), rotmats, joints.float())

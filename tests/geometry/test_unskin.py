@@ -13,6 +13,7 @@ from tube import tube
 from monopart.geometry.body import BodyModel, BodyPose, PosedBody
 from monopart.geometry.body_io import read_npy_object
 from monopart.geometry.errors import InputError
+from monopart.geometry.skinning import blend_transforms, skin
 from monopart.geometry.skinning_field import SkinningField, field_at, field_jacobian, vertex_maps
 from monopart.geometry.surface import SurfaceIndex, closest_on_triangle, vertex_normals
 from monopart.geometry.unskin import Unskinned, inverse_skin
@@ -101,7 +102,10 @@ def test_points_with_a_rest_point_come_back(
         assert share(found.residual <= 1e-5) >= 0.98
         body = BodyModel.default()
         back = skinned(body, body.v_template, posed, found.points)
-        assert ((back - points).norm(dim=-1) - found.residual).abs()[found.valid].max() < 1e-5
+        off = ((back - points).norm(dim=-1) - found.residual).abs()[found.valid]
+        assert share(off < 1e-5) >= 0.999  # two faces at the same distance are both right
+        own = skin(found.points, blend_transforms(posed.transforms, found.weights))
+        assert ((own - points).norm(dim=-1) - found.residual).abs()[found.valid].max() < 2e-6
 
 
 @pytest.mark.parametrize("actor", ["actor_a"])
