@@ -1,10 +1,14 @@
 """What was skipped, and why a picture is empty, in words and numbers."""
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from .avatar import Avatar, View
 from .render import Picture
 from .report_data import SkipRow
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 PER_RAY = 64  # samples of a ray without skipping, as comparable methods take them
 PLAIN_WIDTH = 120  # characters of the table in a file or a pipe
@@ -117,7 +121,6 @@ def print_skipping(rows: Sequence[SkipRow]) -> None:
     Args:
         rows: from `skip_rows` and `module_rows`.
     """
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(title="What was skipped", title_justify="left")
@@ -129,8 +132,15 @@ def print_skipping(rows: Sequence[SkipRow]) -> None:
         known = row.dense is not None and row.kept is not None and row.dense > 0
         share = f"{100 * (row.kept or 0) / (row.dense or 1):.1f} %" if known else "-"
         table.add_row(row.what, _count(row.dense), _count(row.kept), share, row.note)
+    plain_console().print(table)
+
+
+def plain_console() -> "Console":
+    """A console on stderr, wide enough for a table where no terminal says how wide it is."""
+    from rich.console import Console
+
     console = Console(stderr=True)
-    console.print(table, width=None if console.is_terminal else PLAIN_WIDTH)
+    return console if console.is_terminal else Console(stderr=True, width=PLAIN_WIDTH)
 
 
 def _count(value: int | None) -> str:

@@ -14,6 +14,7 @@ from monopart.geometry.culling import ShellSamples
 from monopart.geometry.posed_parts import PosedParts
 
 from .model import AvatarModel, FrameInput, Shaded, distance
+from .skipping import EVERY, Skipping
 
 SPENT = 5e-5  # light left below which a ray stops: the largest change of a colour
 EMPTY = 2e-3  # light that a coarse sample takes below which its surroundings count as empty
@@ -45,6 +46,7 @@ def march(
     frames: FrameInput,
     rays: Rays,
     prune: float = 0.0,
+    skip: Skipping = EVERY,
     coarse: int = 1,
 ) -> Marched:
     """Colours of the rays of one body, without what lies behind an opaque front.
@@ -55,6 +57,7 @@ def march(
         frames: its time and code.
         rays: [R] rays in that frame.
         prune: see :meth:`AvatarModel.shade`.
+        skip: see :meth:`AvatarModel.shade`.
         coarse: look at every so many samples of a ray first, and between two of them only where
             one of the two takes light (approximate); 1 looks at all.
     """
@@ -75,9 +78,9 @@ def march(
         part = samples.rows(keep)
         if coarse > 1:
             lattice = (place[keep] - first) % coarse == 0
-            shaded = _coarse_to_fine(model, bodies, frames, part, prune, lattice)
+            shaded = _coarse_to_fine(model, bodies, frames, part, prune, lattice, skip)
         else:
-            shaded = model.shade(bodies, frames, part, prune)
+            shaded = model.shade(bodies, frames, part, prune, skip)
         delta = torch.full_like(part.depth, step)
         out = composite(shaded.sigma, shaded.color, delta, part.ray_start, part.depth)
         color += light[:, None] * out.color
@@ -94,6 +97,7 @@ def _coarse_to_fine(
     samples: ShellSamples,
     prune: float,
     lattice: Tensor,
+    skip: Skipping,
 ) -> Shaded:
     """Shade the samples of a lattice, then those between two of which one takes light.
 
@@ -104,6 +108,7 @@ def _coarse_to_fine(
         samples: [M] samples of rays.
         prune: see :meth:`AvatarModel.shade`.
         lattice: [M] whether a sample is a coarse one; the last of a ray becomes one.
+        skip: see :meth:`AvatarModel.shade`.
 
     Returns:
         Density and colour of all samples, 0 where none was evaluated; the counts of both passes
@@ -112,14 +117,14 @@ def _coarse_to_fine(
     looked = lattice.clone()
     ends = samples.ray_start[1:][samples.ray_start.diff() > 0] - 1
     looked[ends] = True
-    first = model.shade(bodies, frames, samples.rows(looked), prune)
+    first = model.shade(bodies, frames, samples.rows(looked), prune, skip)
     sigma, color = torch.zeros_like(samples.depth), torch.zeros_like(samples.points)
     sigma[looked], color[looked] = first.sigma, first.color
     # Coarse samples before and after each sample: both lie on its ray, whose ends are coarse.
     taken = sigma[looked] * model.config.geometry.step > EMPTY
     before = looked.long().cumsum(0) - 1
     fine = ~looked & (taken[before] | taken[(before + 1).clamp(max=len(taken) - 1)])
-    second = model.shade(bodies, frames, samples.rows(fine), prune)
+    second = model.shade(bodies, frames, samples.rows(fine), prune, skip)
     sigma[fine], color[fine] = second.sigma, second.color
     counts = {name: first.counts[name] + count for name, count in second.counts.items()}
     return dataclasses.replace(second, sigma=sigma, color=color, counts=counts)

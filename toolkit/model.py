@@ -17,8 +17,10 @@ from monopart.geometry.cameras import Rays
 from monopart.geometry.culling import ShellSamples
 from monopart.geometry.parts import PartMap
 from monopart.geometry.posed_parts import PartPairs, PosedParts, RestPoints
+from monopart.geometry.stages import stage
 
 from .config import Config
+from .skipping import EVERY, Skipping
 
 HIDDEN = 10.0  # optical depth in front of a sample that hides it: 5e-5 of the light is left
 
@@ -147,13 +149,15 @@ class AvatarModel(torch.nn.Module):
 
     def density_of(self, points: Tensor, part: Tensor, counts: tuple[int, ...]) -> tuple:
         """Density, geometry features and hash features of canonical points sorted by part."""
-        encoded = self.field.encode(points, part)
+        with stage("hash encode"):
+            encoded = self.field.encode(points, part)
         prior: Tensor | float = 0.0
-        if self.prior is not None:
-            spec = self.config.field
-            distance = self.prior(points.detach())
-            prior = (spec.prior_slope * (spec.prior_margin - distance)).clamp(-8.0, 8.0)
-        sigma, geometry = self.field.density(encoded, counts, prior)
+        with stage("density"):
+            if self.prior is not None:
+                spec = self.config.field
+                distance = self.prior(points.detach())
+                prior = (spec.prior_slope * (spec.prior_margin - distance)).clamp(-8.0, 8.0)
+            sigma, geometry = self.field.density(encoded, counts, prior)
         return sigma, geometry, encoded
 
     def _kept(
@@ -175,7 +179,12 @@ class AvatarModel(torch.nn.Module):
         return rows, cell[rows]
 
     def shade(
-        self, bodies: PosedParts, frames: FrameInput, samples: ShellSamples, prune: float = 0.0
+        self,
+        bodies: PosedParts,
+        frames: FrameInput,
+        samples: ShellSamples,
+        prune: float = 0.0,
+        skip: Skipping = EVERY,
     ) -> Shaded:
         """Density and colour of samples.
 
@@ -184,34 +193,46 @@ class AvatarModel(torch.nn.Module):
             frames: time and code of each body.
             samples: samples of rays inside the shell.
             prune: skip canonical cells that absorb less than this per sample; 0 skips none.
+            skip: `colors` off evaluates the colour of every pair, for comparison.
         """
-        pairs = bodies.pairs(samples)
-        rest = bodies.unskin(samples, pairs)
+        with stage("part search"):
+            pairs = bodies.pairs(samples)
+        with stage("unskin"):
+            rest = bodies.unskin(samples, pairs)
         found = len(pairs.sample)
-        rows, cell = self._kept(samples, pairs, rest, prune)
-        points, uv = rest.points[rows], rest.uv[rows]
-        pairs = select(pairs, rows, self.num_parts)
-        owner = samples.body[pairs.sample].long()
+        with stage("occupancy"):
+            rows, cell = self._kept(samples, pairs, rest, prune)
+            points, uv = rest.points[rows], rest.uv[rows]
+            pairs = select(pairs, rows, self.num_parts)
+            owner = samples.body[pairs.sample].long()
         residual = None
         canonical = points
         if self.backward_residual is not None:
-            uvt = torch.cat([uv, frames.time[owner, None]], -1)
-            residual = self.backward_residual(uvt, pairs.part, pairs.counts)
-            canonical = points + residual
+            with stage("residual"):
+                uvt = torch.cat([uv, frames.time[owner, None]], -1)
+                residual = self.backward_residual(uvt, pairs.part, pairs.counts)
+                canonical = points + residual
         sigma, geometry, encoded = self.density_of(canonical, pairs.part, pairs.counts)
         if self.training:
-            self.occupancy.see(cell, sigma)
+            with stage("occupancy"):
+                self.occupancy.see(cell, sigma)
         total = len(samples.depth)
-        union = union_by_density(sigma, pairs.sample, pairs.part, total, self.num_parts)
-        code = None if frames.code is None else frames.code[owner[union.winner]]
-        rgb = self.field.color(encoded[union.winner], geometry[union.winner], code, union.counts)
-        color = torch.zeros(total, 3).to(rgb)
-        color = color.index_copy(0, pairs.sample[union.winner], rgb)
+        with stage("union"):
+            union = union_by_density(sigma, pairs.sample, pairs.part, total, self.num_parts)
+        with stage("colour"):
+            rows = union.winner if skip.colors else torch.arange(len(sigma))
+            counted = union.counts if skip.colors else pairs.counts
+            code = None if frames.code is None else frames.code[owner[rows]]
+            rgb = self.field.color(encoded[rows], geometry[rows], code, counted)
+            shown = rgb if skip.colors else rgb[union.winner]
+            color = torch.zeros(total, 3).to(rgb)
+            color = color.index_copy(0, pairs.sample[union.winner], shown)
         counts = {
             "samples_evaluated": total,
             "pairs_found": found,
             "pairs_evaluated": len(pairs.sample),
-            "colors_evaluated": len(union.winner),
+            "colors_evaluated": len(rows),
+            "samples_reached": len(union.winner),  # one winner for each sample that has a pair
         }
         return Shaded(union.sigma, color, pairs, canonical, residual, counts)
 
@@ -223,6 +244,7 @@ class AvatarModel(torch.nn.Module):
         body: Tensor | int = 0,
         jitter: Tensor | None = None,
         prune: float = 0.0,
+        skip: Skipping = EVERY,
     ) -> Rendered:
         """Colours of rays over black, every sample evaluated: the differentiable way.
 
@@ -233,12 +255,15 @@ class AvatarModel(torch.nn.Module):
             body: body of each ray.
             jitter: [R] offsets of the sample lattice in steps.
             prune: see :meth:`shade`.
+            skip: see :meth:`shade`.
         """
         step = self.config.geometry.step
-        samples = bodies.shell.sample(rays, step, body, jitter)
-        shaded = self.shade(bodies, frames, samples, prune)
-        delta = torch.full_like(samples.depth, step)
-        out = composite(shaded.sigma, shaded.color, delta, samples.ray_start, samples.depth)
+        with stage("shell sampling"):
+            samples = bodies.shell.sample(rays, step, body, jitter)
+        shaded = self.shade(bodies, frames, samples, prune, skip)
+        with stage("compositing"):
+            delta = torch.full_like(samples.depth, step)
+            out = composite(shaded.sigma, shaded.color, delta, samples.ray_start, samples.depth)
         stats = {
             "rays": len(rays.directions),
             "samples_dense": samples.dense,

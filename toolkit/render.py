@@ -16,13 +16,17 @@ from monopart.geometry.errors import InputError
 from .avatar import Avatar, View
 from .march import march
 from .scene import SceneBodies, shell_pixels
+from .skipping import EVERY, NONE, Skipping
+from .unskipped import partly_skipping
 
 CHUNK = 16384  # rays at a time: bounds the memory
 STATS = (
+    "rays_box",
     "rays",
     "samples_dense",
     "samples_shell",
     "samples_evaluated",
+    "samples_reached",
     "pairs_found",
     "pairs_evaluated",
     "colors_evaluated",
@@ -52,7 +56,7 @@ def render_view(
     view: View,
     background: float = 0.0,
     prune: float = 0.0,
-    skip: bool = True,
+    skip: Skipping | bool = True,
     scene: SceneBodies | None = None,
     coarse: int = 1,
     half: bool = False,
@@ -65,9 +69,9 @@ def render_view(
         background: grey level behind the person, in [0, 1].
         prune: skip learned empty cells that absorb less than this per sample (approximate); 0 is
             exact.
-        skip: leave out rays and samples outside the body shell (exact) and samples behind an
-            opaque front (within 5e-5); off evaluates every part at every sample in the box of the
-            body: the dense renderer, for comparison.
+        skip: what to leave out; True is all of it (`cells` only where `prune` asks for it), False
+            nothing: the dense renderer, which searches every part at every sample in the box of
+            the body, for comparison.
         scene: the posed body if it exists already.
         coarse: see :func:`march` (approximate); 1 is exact.
         half: run the networks in float16 (approximate).
@@ -105,7 +109,7 @@ def _render_view(
     view: View,
     background: float,
     prune: float,
-    skip: bool,
+    skip: Skipping | bool,
     scene: SceneBodies | None,
     coarse: int,
 ) -> Picture:
@@ -113,24 +117,23 @@ def _render_view(
     scene = scene or avatar.pose_scene(view.pose)
     inputs = avatar.frame_input(view.frame, view.pose)
     height, width = view.camera.size
-    if skip:
-        index, rays = shell_pixels(view.camera, scene, 0)
-    else:
-        index = torch.arange(height * width)
-        rays = scene.local_rays(view.camera.rays(view.camera.pixel_grid().reshape(-1, 2)), 0)
-        rays = Rays(rays.origins.expand_as(rays.directions), rays.directions)
-    bodies = scene.parts if skip else scene.parts.unculled()
+    if isinstance(skip, bool):
+        skip = EVERY if skip else NONE
+    prune = prune if skip.cells else 0.0
+    index, rays, looked_at = shell_pixels(view.camera, scene, 0, skip)
+    bodies = partly_skipping(scene.parts, skip)
     color = torch.zeros(height * width, 3)
     opacity, depth = torch.zeros(2, height * width).unbind(0)
     # Every count is there, also where no ray hits the shell.
     stats: Counter[str] = Counter({"pixels": height * width, **dict.fromkeys(STATS, 0)})
+    stats["rays_box"] = looked_at
     for start in range(0, len(index), CHUNK):
         part = slice(start, start + CHUNK)
         chunk = Rays(rays.origins[part], rays.directions[part])
-        if skip:
-            out = march(model, bodies, inputs, chunk, prune, coarse)
+        if skip.light:
+            out = march(model, bodies, inputs, chunk, prune, skip, coarse)
         else:
-            out = model.render_rays(bodies, inputs, chunk, 0, None, prune)
+            out = model.render_rays(bodies, inputs, chunk, 0, None, prune, skip)
         color[index[part]] = out.color
         opacity[index[part]] = out.opacity
         depth[index[part]] = out.depth

@@ -15,6 +15,7 @@ from .cache import NO_CACHE, Cache
 from .captures.records import CaptureRecord
 from .config import Config
 from .prepared import body_shell
+from .skipping import EVERY, Skipping
 
 
 def stack_poses(poses: list[BodyPose]) -> BodyPose:
@@ -94,22 +95,32 @@ def canonical_body(record: CaptureRecord) -> PosedBody:
         return record.body.canonical(record.poses[first].betas)
 
 
-def shell_pixels(camera: Camera, scene: SceneBodies, body: int) -> tuple[Tensor, Rays]:
+def shell_pixels(
+    camera: Camera, scene: SceneBodies, body: int, skip: Skipping = EVERY
+) -> tuple[Tensor, Rays, int]:
     """Pixels of a camera whose rays enter the shell of a body, and those rays in its local frame.
 
     All other pixels are background exactly.
 
+    Args:
+        camera: the camera.
+        scene: posed bodies.
+        body: which of them.
+        skip: `box` off looks at every pixel of the image, `shell` off keeps rays that miss.
+
     Returns:
-        Flat row-major pixel indices and their local rays.
+        Flat row-major pixel indices, their local rays, and the number of pixels looked at.
     """
-    width = camera.size[1]
-    x0, y0, x1, y1 = _screen_box(camera, scene, body)
+    height, width = camera.size
+    x0, y0, x1, y1 = _screen_box(camera, scene, body) if skip.box else (0, 0, width, height)
     ys, xs = torch.meshgrid(torch.arange(y0, y1), torch.arange(x0, x1), indexing="ij")
     pixels = torch.stack([xs, ys], -1).reshape(-1, 2).float() + 0.5
     rays = scene.local_rays(camera.rays(pixels), body)
+    index, origins = (ys * width + xs).reshape(-1), rays.origins.expand_as(rays.directions)
+    if not skip.shell:
+        return index, Rays(origins, rays.directions), len(pixels)
     _, _, hit = scene.parts.shell.intervals(rays, body)
-    index = (ys * width + xs).reshape(-1)[hit]
-    return index, Rays(rays.origins.expand_as(rays.directions)[hit], rays.directions[hit])
+    return index[hit], Rays(origins[hit], rays.directions[hit]), len(pixels)
 
 
 def _screen_box(camera: Camera, scene: SceneBodies, body: int) -> tuple[int, int, int, int]:

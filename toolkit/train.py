@@ -15,6 +15,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from monopart.geometry.cameras import Rays
 from monopart.geometry.consistency import consistency_loss
 from monopart.geometry.errors import MonopartError
+from monopart.geometry.stages import stage
 
 from .avatar import Avatar
 from .captures.cache import Pictures, read_pictures
@@ -25,6 +26,7 @@ from .lpips import LPIPS, load_lpips
 from .model import Rendered
 from .optimizer import make_optimizer
 from .resume import forget_state, save_state
+from .skipping import EVERY
 
 MAX_BAD_STEPS = 20  # non-finite losses in a row after which a run ends
 PRUNE = 2e-3  # absorption of a step below which a canonical cell counts as empty in training
@@ -86,6 +88,7 @@ class Trainer:
         self.optimizer = make_optimizer(avatar.model, self.config)
         self.average = [p.detach().clone() for p in avatar.model.parameters()]
         self.bad_steps = 0
+        self.skip = EVERY  # what a step leaves out; a comparison switches kinds off
         self.last: dict[str, float] = {}
 
     def _load_lpips(self) -> LPIPS | None:
@@ -123,17 +126,28 @@ class Trainer:
         model.zero_grad(set_to_none=True)
 
     def _render(self, batch: PixelBatch, step: int) -> Rendered:
-        rays, body = self.rays(batch)
-        jitter = torch.rand(len(body), generator=self.generator)
-        probe = step % PROBE_EVERY == 0 or not self.config.train.occupancy
+        with stage("rays"):
+            rays, body = self.rays(batch)
+            jitter = torch.rand(len(body), generator=self.generator)
         return self.avatar.model.render_rays(
             self.scene.parts,
             self.avatar.training_input(),
             rays,
             body,
             jitter,
-            prune=0.0 if probe else PRUNE,
+            prune=0.0 if self.is_probe(step) or not self.skip.cells else PRUNE,
+            skip=self.skip,
         )
+
+    def is_probe(self, step: int) -> bool:
+        """Whether a step evaluates learned empty cells too, which refreshes them."""
+        return step % PROBE_EVERY == 0 or not self.config.train.occupancy
+
+    def has_patch(self, step: int, done: float) -> bool:
+        """Whether a step has an LPIPS patch."""
+        loop = self.config.train
+        on = self.lpips is not None and done >= loop.lpips_start
+        return on and step % loop.lpips_every == 0
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Rendered]:
         """The weighted terms of one step.
@@ -146,25 +160,26 @@ class Trainer:
             Named terms whose sum is minimised, and the rendering.
         """
         spec, loop = self.config.loss, self.config.train
-        batch = self.sampler.random(loop.rays, self.generator)
-        with_patch = (
-            self.lpips is not None and done >= loop.lpips_start and step % loop.lpips_every == 0
-        )
-        patch = self.sampler.patch(loop.patch, self.generator) if with_patch else None
-        if patch is not None:
-            batch = _joined(batch, patch)
+        with stage("batch"):
+            batch = self.sampler.random(loop.rays, self.generator)
+            with_patch = self.has_patch(step, done)
+            patch = self.sampler.patch(loop.patch, self.generator) if with_patch else None
+            if patch is not None:
+                batch = _joined(batch, patch)
         out = self._render(batch, step)
         ground = torch.zeros(3)
         if loop.random_background:
             ground = torch.rand(3, generator=self.generator)
-        color = out.color + (1.0 - out.opacity)[:, None] * ground
-        target = batch.color + (~batch.mask)[:, None] * ground
-        terms = {"mse": spec.mse * color_loss(color, target)}
+        with stage("loss: colour"):
+            color = out.color + (1.0 - out.opacity)[:, None] * ground
+            target = batch.color + (~batch.mask)[:, None] * ground
+            terms = {"mse": spec.mse * color_loss(color, target)}
         if patch is not None and self.lpips is not None:
             height = min(loop.patch, self.sampler.height)
             shape = (1, height, -1, 3)
-            seen, wanted = color[loop.rays :].reshape(shape), target[loop.rays :].reshape(shape)
-            terms["lpips"] = spec.lpips * self.lpips(seen.clamp(0, 1), wanted).mean()
+            with stage("loss: LPIPS"):
+                seen, wanted = color[loop.rays :].reshape(shape), target[loop.rays :].reshape(shape)
+                terms["lpips"] = spec.lpips * self.lpips(seen.clamp(0, 1), wanted).mean()
         terms.update(self._deformation_terms(out))
         return terms, out
 
@@ -173,23 +188,25 @@ class Trainer:
         if out.shaded.residual is None:
             return terms
         if spec.offset:
-            terms["offset"] = spec.offset * offset_loss(out.shaded.residual)
+            with stage("loss: offset"):
+                terms["offset"] = spec.offset * offset_loss(out.shaded.residual)
         if self.canonical is not None and self.avatar.model.forward_residual is not None:
             count = len(out.shaded.pairs.sample)
-            rows = torch.randint(
-                max(count, 1), (min(spec.consistency_samples, count),), generator=self.generator
-            ).sort()[0]
-            distance = round_trip_distance(
-                self.avatar.model,
-                self.scene.parts,
-                self.canonical,
-                self.avatar.training_input(),
-                out,
-                rows,
-            )
-            terms["consistency"] = spec.consistency * consistency_loss(
-                distance, spec.consistency_threshold
-            )
+            with stage("loss: consistency"):
+                rows = torch.randint(
+                    max(count, 1), (min(spec.consistency_samples, count),), generator=self.generator
+                ).sort()[0]
+                distance = round_trip_distance(
+                    self.avatar.model,
+                    self.scene.parts,
+                    self.canonical,
+                    self.avatar.training_input(),
+                    out,
+                    rows,
+                )
+                terms["consistency"] = spec.consistency * consistency_loss(
+                    distance, spec.consistency_threshold
+                )
         return terms
 
     def step(self, step: int, done: float) -> dict[str, float]:
@@ -209,9 +226,12 @@ class Trainer:
             self._bad_step(terms)
             return self.last
         self.bad_steps = 0
-        total.backward()
-        self.optimizer.step()
-        self._average(step)
+        with stage("backward"):
+            total.backward()
+        with stage("optimiser"):
+            self.optimizer.step()
+        with stage("average of the weights"):
+            self._average(step)
         self.last = {name: float(term.detach()) for name, term in terms.items()}
         mse = self.last["mse"] / (self.config.loss.mse or 1.0)
         self.last["psnr"] = -10.0 * math.log10(max(mse, 1e-12))

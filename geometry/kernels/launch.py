@@ -16,6 +16,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from monopart.geometry.stages import stage
+
 _SMALL = 1024  # below this many items a second thread costs more than it saves
 _LOCK = threading.Lock()
 _READY: list[bool] = []
@@ -99,16 +101,18 @@ def _run_side_by_side(kernel: Any, jobs: list[tuple[int, list[Any]]]) -> None:
     """Run CPU launches on the pool; the first ever runs alone, so that it compiles once."""
     if kernel not in _COMPILED:
         dim, inputs = jobs[0]
-        wp.launch(kernel, dim=dim, inputs=inputs, device="cpu", record_tape=False)
+        _launch_on_cpu(kernel, dim, inputs)
         _COMPILED.add(kernel)
         jobs = jobs[1:]
     pool = _pool(torch.get_num_threads())
-    futures = [
-        pool.submit(wp.launch, kernel, dim=dim, inputs=inputs, device="cpu", record_tape=False)
-        for dim, inputs in jobs
-    ]
+    futures = [pool.submit(_launch_on_cpu, kernel, dim, inputs) for dim, inputs in jobs]
     for future in futures:
         future.result()
+
+
+def _launch_on_cpu(kernel: Any, dim: int, inputs: list[Any]) -> None:
+    with stage(kernel.key, "kernel"):
+        wp.launch(kernel, dim=dim, inputs=inputs, device="cpu", record_tape=False)
 
 
 def launch_jobs(kernel: Any, jobs: list[list[Any]], count: int, like: Tensor) -> None:
@@ -136,6 +140,7 @@ def launch_one(kernel: Any, count: int, args: list[Any], like: Tensor) -> None:
     """Run one unsplit launch (a scatter kernel on one thread, or anything on CUDA)."""
     if like.device.type == "cuda":
         stream = wp.stream_from_torch(torch.cuda.current_stream(like.device))
-        wp.launch(kernel, dim=count, inputs=[0, *args], stream=stream)
+        with stage(kernel.key, "kernel"):
+            wp.launch(kernel, dim=count, inputs=[0, *args], stream=stream)
     else:
-        wp.launch(kernel, dim=count, inputs=[0, *args], device="cpu")
+        _launch_on_cpu(kernel, count, [0, *args])
