@@ -15,6 +15,7 @@ from monopart.geometry.errors import InputError
 from .config import Config
 from .overrides import overridden
 from .presets import preset, preset_names
+from .skipping import EVERY, KINDS
 
 PROGRAM = """Animatable avatars from monocular video.
 
@@ -39,6 +40,7 @@ MovedCapture = Annotated[
 Settings = Annotated[
     tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="SECTION.ENTRY=VALUE ...")
 ]
+KindsOfSkipping = Annotated[tuple[str, ...], arg(metavar="|".join(KINDS) + " ...")]
 PresetName = Annotated[
     str,
     arg(metavar="NAME", help="Configuration to start from: " + ", ".join(preset_names()) + "."),
@@ -74,7 +76,10 @@ class Train:
     images: MaybeImages = None
     """Held-out images to evaluate per split, evenly spread."""
     explain: bool = False
-    """Print a table of the rays, samples, part evaluations and modules that were skipped."""
+    """Print tables of the rays, samples, part evaluations and modules that were skipped, and of the
+    time that this saves."""
+    profile: bool = False
+    """Measure where a step's time goes first; writes profile.html and profile.json (a trace)."""
     resume: bool = False
     """Go on with the unfinished run in --out, with its own configuration."""
 
@@ -92,6 +97,7 @@ class Train:
             images=self.images,
             explain=self.explain,
             resume=self.resume,
+            profile=self.profile,
         )
 
 
@@ -140,7 +146,10 @@ class Render:
     capture: MovedCapture = None
     """Folder of the capture, if it has moved."""
     explain: bool = False
-    """Print a table of the rays, samples and part evaluations that were skipped."""
+    """Print tables of the rays, samples and part evaluations that were skipped, and of the time
+    that each kind saves (the picture is rendered without each)."""
+    no_skip: KindsOfSkipping = ()
+    """Kinds of skipping to switch off."""
     coarse: Count = 1
     """Look at every N-th sample of a ray first and fill in where there is something; 1 is exact."""
     half: bool = False
@@ -150,6 +159,9 @@ class Render:
         """Do it."""
         check_file("--out", self.out, ".png")
         check_count("--coarse", self.coarse)
+        skip = EVERY.without(self.no_skip)
+        if self.coarse > 1 and not skip.light:
+            raise InputError("--coarse: expected 1 together with --no-skip light; drop one of them")
         from . import commands
 
         commands.render(
@@ -158,9 +170,7 @@ class Render:
             self.frame,
             self.out,
             self.capture,
-            self.explain,
-            coarse=self.coarse,
-            half=self.half,
+            commands.Choices(self.explain, self.coarse, self.half, skip),
         )
 
 

@@ -21,11 +21,15 @@ from .captures import check_capture, describe, read_capture
 from .captures.cache import read_pictures
 from .config import Config
 from .explain import print_skipping, why_empty
+from .profile_page import print_profile, write_profile
+from .profiling import profile_training
 from .progress import counted, progress_bar
 from .render import Picture, render_view, render_views
 from .results import evaluate_splits, held_out, say, skipping, summary, write_results, write_scores
 from .resume import load_state
 from .runs import check_free, create_run, next_free, open_run, read_facts, resumable
+from .savings import print_savings, rendering_savings, training_savings
+from .skipping import EVERY, Skipping
 from .train import Trainer, TrainResult
 from .video import save_png, write_video
 
@@ -58,6 +62,7 @@ def train(
     images: int | None = None,
     explain: bool = False,
     resume: bool = False,
+    profile: bool = False,
 ) -> Path:
     """Train on a capture, evaluate, write the report; the scores and its path go to stdout.
 
@@ -69,8 +74,9 @@ def train(
         config: the resolved configuration.
         params: name of the folder of body poses, None for the capture's own.
         images: held-out images to evaluate per split; None for all.
-        explain: print the table of what was skipped.
+        explain: print the table of what was skipped, and the time that each kind saves.
         resume: go on with an unfinished run in ``out``, with its own configuration.
+        profile: measure the stages of a step first; writes profile.json and profile.html.
 
     Returns:
         The report.
@@ -80,7 +86,13 @@ def train(
         KeyboardInterrupt: the training was interrupted; everything is written.
     """
     stages = Stages()
-    avatar, result, interrupted = _trained(capture, out, config, params, stages, resume)
+    trainer = _trainer(capture, out, config, params, stages, resume)
+    if profile:
+        _profile(trainer, out)
+    interrupted = _train(trainer, stages)
+    avatar, result = trainer.avatar, trainer.result
+    if explain:
+        print_savings("What skipping saves in a training step", training_savings(trainer))
     with stages.timed("evaluation"):
         evaluations = evaluate_splits(avatar, held_out(avatar.record), images)
     size = min(STRIP_SIZE, *avatar.record.image_size)
@@ -107,7 +119,9 @@ def demo(capture: Path, out: Path, config: Config) -> Path:
     run, stages = next_free(out), Stages()
     if run != out:
         say(f"{out} exists; this run goes to {run}")
-    avatar, result, interrupted = _trained(capture, run, config, None, stages)
+    trainer = _trainer(capture, run, config, None, stages)
+    interrupted = _train(trainer, stages)
+    avatar, result = trainer.avatar, trainer.result
     with stages.timed("evaluation"):
         evaluations = evaluate_splits(avatar, held_out(avatar.record), None)
     with stages.timed("turntable video"):
@@ -122,15 +136,15 @@ def demo(capture: Path, out: Path, config: Config) -> Path:
     return report
 
 
-def _trained(
+def _trainer(
     capture: Path,
     out: Path,
     config: Config,
     params: str | None,
     stages: Stages,
     resume: bool = False,
-) -> tuple[Avatar, TrainResult, bool]:
-    """The avatar of a run, what its training did, and whether that was interrupted."""
+) -> Trainer:
+    """Everything that a training needs, read and prepared; the run folder is made."""
     if resume:
         config, params = resumable(out)
     else:
@@ -153,12 +167,26 @@ def _trained(
         update(1.0, "")
     with stages.timed("kernels (compiled once per machine)"):
         trainer.warm_up()
-    say(f"{record.name}: training preset {config.preset} on {len(trainer.body_of_image)} images")
+    return trainer
+
+
+def _profile(trainer: Trainer, run: Path) -> None:
+    """Measure the stages of a step on a copy; the training is not touched."""
+    with progress_bar("Profiling") as update:
+        profiles = profile_training(trainer, lambda i, n: update(i / n, f"step {i}/{n}"))
+    print_profile(profiles)
+    write_profile(run, profiles)
+    say(f"profile: {run / 'profile.html'}")
+
+
+def _train(trainer: Trainer, stages: Stages) -> bool:
+    """Train; True where an interrupt ended it early."""
+    name, preset = trainer.avatar.record.name, trainer.config.preset
+    say(f"{name}: training preset {preset} on {len(trainer.body_of_image)} images")
     interrupted = _run_loop(trainer)
     stages.seconds["training"] = trainer.result.seconds
-    result = trainer.result
-    say(f"trained {result.iterations} steps in {result.seconds:.1f} s")
-    return avatar, result, interrupted
+    say(f"trained {trainer.result.iterations} steps in {trainer.result.seconds:.1f} s")
+    return interrupted
 
 
 def _run_loop(trainer: Trainer) -> bool:
@@ -225,15 +253,30 @@ def _training_facts(path: Path) -> tuple[TrainResult, dict[str, float]]:
     return TrainResult(**{n: facts[n] for n in names}), facts["stages"]
 
 
+@dataclass(frozen=True)
+class Choices:
+    """How a picture is made.
+
+    Attributes:
+        explain: print the table of what was skipped, and the time that each kind saves.
+        coarse: samples of a ray per coarse one; 1 is exact.
+        half: run the networks in float16.
+        skip: what to leave out.
+    """
+
+    explain: bool = False
+    coarse: int = 1
+    half: bool = False
+    skip: Skipping = EVERY
+
+
 def render(
     run: Path,
     camera: str,
     frame: int,
     out: Path,
     capture: Path | None,
-    explain: bool,
-    coarse: int = 1,
-    half: bool = False,
+    choices: Choices,
 ) -> None:
     """Render one camera at one frame of the capture.
 
@@ -243,22 +286,21 @@ def render(
         frame: frame that gives the body pose.
         out: picture to write.
         capture: the capture, if it has moved.
-        explain: print the table of what was skipped.
-        coarse: samples of a ray per coarse one; 1 is exact.
-        half: run the networks in float16.
+        choices: how.
     """
     avatar = open_run(run, capture)
     index = avatar.record.camera_index(camera)
     view = View(avatar.record.cameras[index], pose_of(avatar.record, frame), frame)
     start = time.perf_counter()
-    picture = render_view(avatar, view, coarse=coarse, half=half)
+    picture = render_view(avatar, view, skip=choices.skip, coarse=choices.coarse, half=choices.half)
     took = time.perf_counter() - start
     save_png(out, as_uint8(picture.color))
     why = why_empty(avatar, view, picture)
     if why is not None:
         say(f"warning: camera {camera}, frame {frame}: nothing is visible: {why}")
-    if explain:
+    if choices.explain:
         print_skipping(skipping(avatar, {}, 0, picture.stats))
+        print_savings("What skipping saves in this picture", rendering_savings(avatar, view))
     say(f"rendered in {took:.2f} s")
     print(out)
 

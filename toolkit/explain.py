@@ -28,14 +28,21 @@ def skip_rows(stats: Mapping[str, int], what: str, num_parts: int) -> list[SkipR
         num_parts: parts of the body.
 
     >>> [r.kept for r in skip_rows({"pixels": 100, "rays": 9}, "rendering", 5)][:2]
-    [9, None]
+    [100, 9]
     """
     rows, shell = [], stats.get("samples_shell")
     if "pixels" in stats:
+        boxed = stats.get("rays_box", stats["pixels"])
         rows += [
             SkipRow(
-                f"{what}: rays",
+                f"{what}: rays in the box of the body",
                 stats["pixels"],
+                boxed,
+                "exact: the shell lies inside the box",
+            ),
+            SkipRow(
+                f"{what}: rays of the box",
+                boxed,
                 stats.get("rays"),
                 "exact: a ray that misses the body shell is background",
             ),
@@ -44,6 +51,12 @@ def skip_rows(stats: Mapping[str, int], what: str, num_parts: int) -> list[SkipR
                 PER_RAY * stats["pixels"],
                 shell,
                 "exact: density is 0 farther than the radius from every part",
+            ),
+            SkipRow(
+                f"{what}: of the same samples, those that reach a network",
+                PER_RAY * stats["pixels"],
+                stats.get("colors_evaluated"),
+                "all of the rows below together",
             ),
         ]
     evaluated = stats.get("samples_evaluated", shell)
