@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .part_union import Union as Union
     from .part_union import union_by_density as union_by_density
     from .residual import ResidualField as ResidualField
+    from .row_adam import RowAdam as RowAdam
     from .volume import composite as composite
 
 _ROOM = {
@@ -34,6 +35,7 @@ _ROOM = {
     "PartMLP": "mlp",
     "PartOccupancy": "occupancy",
     "ResidualField": "residual",
+    "RowAdam": "row_adam",
     "Union": "part_union",
     "composite": "volume",
     "union_by_density": "part_union",

@@ -30,6 +30,7 @@ class DistancePrior(torch.nn.Module):
         faces: Int[Tensor, "f 3"],
         reach: float = 0.12,
         cell: float = 0.01,
+        values: Float[Tensor, "z y x"] | None = None,
     ) -> None:
         """Sample the distance on a grid.
 
@@ -38,9 +39,11 @@ class DistancePrior(torch.nn.Module):
             faces: triangles, counter-clockwise from outside.
             reach: distances beyond it are clamped, metres.
             cell: edge of a grid cell, metres.
+            values: the nodes of an earlier instance with the same arguments (its ``values[0, 0]``),
+                where a caller kept them; nothing is then sampled.
 
         Raises:
-            InputError: not 0 < cell <= reach.
+            InputError: not 0 < cell <= reach, or values of another grid.
         """
         super().__init__()
         if not 0 < cell <= reach:
@@ -53,15 +56,14 @@ class DistancePrior(torch.nn.Module):
         steps = ((verts.amax(0) + reach - lo) / cell).ceil().long() + 1
         self.register_buffer("lo", lo, persistent=False)
         self.register_buffer("extent", (steps - 1) * cell, persistent=False)
-        axes = [lo[a] + cell * torch.arange(int(steps[a]), device=lo.device) for a in range(3)]
-        z, y, x = torch.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
-        nodes = torch.stack([x, y, z], -1).reshape(-1, 3)
-        near = BodyShell(verts, faces, reach).occupied(nodes)
-        found = nodes[near]
-        hit = SurfaceIndex(verts, faces).query(found, max_distance=reach)
-        distance = torch.full_like(nodes[:, 0], torch.inf)
-        distance[near] = signed_distance(found, hit, vertex_normals(verts, faces), faces)
-        values = _fill_unknown(distance.reshape(z.shape), reach).clamp(-reach, reach)
+        if values is None:
+            values = _sampled(verts, faces, lo, steps, reach, cell)
+        shape = tuple(steps.flip(0).tolist())
+        if values.shape != shape or values.dtype != torch.float32:
+            raise InputError(
+                f"values: expected a float32 grid of {shape}, found {values.dtype} of "
+                f"{tuple(values.shape)}; leave them out, then they are sampled"
+            )
         self.register_buffer("values", values[None, None], persistent=False)
 
     def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -78,6 +80,21 @@ class DistancePrior(torch.nn.Module):
             self.values, place[None, None, None], padding_mode="border", align_corners=True
         )
         return sampled.reshape(-1)
+
+
+def _sampled(
+    verts: Tensor, faces: Tensor, lo: Tensor, steps: Tensor, reach: float, cell: float
+) -> Tensor:
+    """Clamped signed distance at the nodes of the grid, [Z, Y, X]."""
+    axes = [lo[a] + cell * torch.arange(int(steps[a]), device=lo.device) for a in range(3)]
+    z, y, x = torch.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+    nodes = torch.stack([x, y, z], -1).reshape(-1, 3)
+    near = BodyShell(verts, faces, reach).occupied(nodes)
+    found = nodes[near]
+    hit = SurfaceIndex(verts, faces).query(found, max_distance=reach)
+    distance = torch.full_like(nodes[:, 0], torch.inf)
+    distance[near] = signed_distance(found, hit, vertex_normals(verts, faces), faces)
+    return _fill_unknown(distance.reshape(z.shape), reach).clamp(-reach, reach)
 
 
 def _fill_unknown(distance: Tensor, reach: float) -> Tensor:

@@ -78,6 +78,9 @@ class HashGrid(torch.nn.Module):
         sizes: [K, L] int32, rows.
         masks: [K, L] int32, ``sizes − 1`` of a hashed level, 0 of a dense one.
         resolutions: [K, L] int32, cells per axis.
+        accumulate: the Warp backward pass adds to ``table.grad`` in place in place of handing a
+            new gradient of the whole table to autograd, for an optimiser that zeroes what it used
+            (:class:`RowAdam`). ``torch.autograd.grad`` then finds none for the table.
 
     Reference: Müller et al., Instant Neural Graphics Primitives, 2022, section 3.
 
@@ -126,6 +129,7 @@ class HashGrid(torch.nn.Module):
             self.register_buffer(name, values.to(torch.int32), persistent=False)
         table = torch.rand(total, self.features, generator=generator)
         self.table = torch.nn.Parameter((table * 2 - 1) * _INIT)
+        self.accumulate = False
 
     @property
     def out_features(self) -> int:
@@ -167,7 +171,9 @@ class HashGrid(torch.nn.Module):
             return self._forward_torch(points, part)
         if self.features in WARP_FEATURES:
             layout = (self.offsets, self.masks, self.resolutions)
-            return _WarpHashGrid.apply(points, self.table, part, layout)
+            # a table put in by functional_call has no .grad of its own
+            own = self.table if self.accumulate and self.table.is_leaf else None
+            return _WarpHashGrid.apply(points, self.table, part, layout, own)
         if backend == "auto":
             return self._forward_torch(points, part)
         raise BackendError(
@@ -218,7 +224,12 @@ class _WarpHashGrid(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, points: Tensor, table: Tensor, part: Tensor | None, layout: tuple[Tensor, ...]
+        ctx: Any,
+        points: Tensor,
+        table: Tensor,
+        part: Tensor | None,
+        layout: tuple[Tensor, ...],
+        own: Tensor | None,
     ) -> Tensor:
         from monopart.geometry.kernels.launch import launch, view
 
@@ -231,6 +242,7 @@ class _WarpHashGrid(torch.autograd.Function):
         args = [view(points, 3), view(part), _table_rows(table), *map(view, layout)]
         launch(forward_kernel(features), n, [*args, _level_rows(out, features)], points)
         ctx.save_for_backward(points, table, part, *layout)
+        ctx.own = own
         return out
 
     @staticmethod
@@ -244,8 +256,16 @@ class _WarpHashGrid(torch.autograd.Function):
         cotangent = cotangents[0].contiguous()
         saved = (points, table, part, layout, cotangent)
         grad_points = _points_gradient(*saved) if ctx.needs_input_grad[0] else None
-        grad_table = _table_gradient(*saved) if ctx.needs_input_grad[1] else None
-        return grad_points, grad_table, None, None
+        if not ctx.needs_input_grad[1]:
+            return grad_points, None, None, None, None
+        if ctx.own is None:
+            grad_table = _zeros_like(table)
+            _add_table_gradient(grad_table, *saved)
+            return grad_points, grad_table, None, None, None
+        if ctx.own.grad is None:
+            ctx.own.grad = _zeros_like(table)
+        _add_table_gradient(ctx.own.grad, *saved)
+        return grad_points, None, None, None, None
 
 
 def _table_rows(table: Tensor) -> Any:
@@ -286,15 +306,19 @@ def _points_gradient(
     return grad
 
 
-def _table_gradient(
-    points: Tensor, table: Tensor, part: Tensor, layout: list[Tensor], cotangent: Tensor
-) -> Tensor:
+def _add_table_gradient(
+    grad: Tensor,
+    points: Tensor,
+    table: Tensor,
+    part: Tensor,
+    layout: list[Tensor],
+    cotangent: Tensor,
+) -> None:
     from monopart.geometry.kernels.launch import launch_jobs, view
 
     from .kernels.hash_grid import table_kernel
 
     features, levels = table.shape[1], layout[0].shape[1]
-    grad = _zeros_like(table)
     args = [view(points, 3), view(part), *map(view, layout), _level_rows(cotangent, features)]
     cuda = points.device.type == "cuda"
     # disjoint levels per job: no atomics, and the same sums for any number of threads
@@ -305,4 +329,3 @@ def _table_gradient(
         len(points),
         points,
     )
-    return grad

@@ -19,6 +19,8 @@ class PartMLP(torch.nn.Module):
     Attributes:
         weights: per layer [K, out, in].
         biases: per layer [K, out].
+        compute: type in which the products are taken, such as ``torch.float16``; None is that of
+            the parameters. The result has the type of the input.
 
     >>> mlp = PartMLP(2, (3, 16, 4), zero_last=True)
     >>> mlp(torch.rand(5, 3), (2, 3)).abs().max().item()
@@ -51,6 +53,7 @@ class PartMLP(torch.nn.Module):
             )
         self.parts = parts
         self.widths = widths
+        self.compute: torch.dtype | None = None
         self.weights = torch.nn.ParameterList()
         self.biases = torch.nn.ParameterList()
         for fan_in, fan_out in itertools.pairwise(widths):
@@ -86,17 +89,21 @@ class PartMLP(torch.nn.Module):
             InputError: counts that do not fit.
         """
         counts = self._check_counts(x, counts)
+        weights, biases, kind = list(self.weights), list(self.biases), x.dtype
+        if self.compute is not None:
+            x = x.to(self.compute)
+            weights, biases = ([p.to(self.compute) for p in ps] for ps in (weights, biases))
         # unbind makes one gradient per layer, with zeros for the parts that took no rows
         layers = [
             (weight.transpose(1, 2).unbind(0), bias.unbind(0))
-            for weight, bias in zip(self.weights, self.biases, strict=True)
+            for weight, bias in zip(weights, biases, strict=True)
         ]
         outputs = []
         for part, rows in enumerate(x.split(counts)):
             # with no rows at all, part 0 runs on none, so that gradients are zero, not None
             if counts[part] > 0 or (part == 0 and len(x) == 0):
                 outputs.append(_run(rows, [(w[part], b[part]) for w, b in layers]))
-        return torch.cat(outputs) if len(outputs) > 1 else outputs[0]
+        return (torch.cat(outputs) if len(outputs) > 1 else outputs[0]).to(kind)
 
     def _check_counts(self, x: Tensor, counts: Sequence[int] | None) -> list[int]:
         if x.shape[1] != self.widths[0]:

@@ -64,9 +64,12 @@ def _vertex_reach(verts: Tensor, faces: Tensor) -> Tensor:
 
     No point of a triangle is farther than (longest edge)/sqrt(3) from the nearest corner.
     """
-    corners = verts[:, faces]
-    edges = corners - corners.roll(-1, dims=2)
-    longest = edges.norm(dim=-1).amax(dim=(0, 2)) / 3**0.5
+    sides = torch.stack([faces, faces.roll(-1, dims=1)], -1)
+    single = sides.amin(-1) * verts.shape[1] + sides.amax(-1)  # two faces share an edge
+    edges, row = single.unique(return_inverse=True)
+    along = verts[:, edges // verts.shape[1]] - verts[:, edges % verts.shape[1]]
+    length = along.square_().sum(-1).amax(0).sqrt()
+    longest = length[row].amax(1) / 3**0.5
     reach = torch.zeros(verts.shape[1], dtype=verts.dtype, device=verts.device)
     return reach.scatter_reduce(0, faces.reshape(-1), longest.repeat_interleave(3), "amax")
 
@@ -97,6 +100,7 @@ class BodyShell:
         radius: float | Float[Tensor, "k"],
         face_part: Int[Tensor, "f"] | None = None,
         voxel: float = 0.02,
+        grid: Int[Tensor, "g"] | None = None,
     ) -> None:
         """Mark the voxels.
 
@@ -106,9 +110,12 @@ class BodyShell:
             radius: metres; one number, or one per part.
             face_part: part of each face, 0 to 30; None is one part.
             voxel: edge of a voxel, metres.
+            grid: bits of all voxels, int32: the ``grid`` of an earlier shell of the same arguments,
+                where a caller kept it; no voxel is then marked.
 
         Raises:
-            InputError: radius or voxel not positive, more than 31 parts, non-finite vertices.
+            InputError: radius or voxel not positive, more than 31 parts, non-finite vertices, or a
+                grid of another size.
         """
         verts = verts.detach().reshape(-1, *verts.shape[-2:]).float()
         parts = torch.zeros_like(faces[:, 0]) if face_part is None else face_part
@@ -124,12 +131,9 @@ class BodyShell:
         self.radius = radii
         self.voxel = voxel
         self.num_parts = count
-        self._build(verts.contiguous(), faces.long(), parts)
+        self._build(verts.contiguous(), faces.long(), parts, grid)
 
-    def _build(self, verts: Tensor, faces: Tensor, face_part: Tensor) -> None:
-        from .kernels.launch import launch, view
-        from .kernels.shell import splat_bodies
-
+    def _build(self, verts: Tensor, faces: Tensor, face_part: Tensor, grid: Tensor | None) -> None:
         bits = _vertex_bits(faces, face_part, verts.shape[1])
         # the largest radius of its parts, the reach of its triangles, half a voxel diagonal
         owned = (bits[:, None] >> torch.arange(self.num_parts, device=bits.device)) & 1
@@ -142,9 +146,22 @@ class BodyShell:
         self.dims = (extent / self.voxel).ceil().int().clamp(min=1).contiguous()
         cells = self.dims.long().prod(1)
         self.offset = (cells.cumsum(0) - cells).contiguous()
-        self.grid = torch.zeros(int(cells.sum()), dtype=torch.int32, device=verts.device)
+        total = int(cells.sum())
+        if grid is not None and (grid.shape != (total,) or grid.dtype != torch.int32):
+            raise InputError(
+                f"grid: expected {total} int32 voxels of these bodies, found {tuple(grid.shape)} "
+                f"of {grid.dtype}; leave it out, then the voxels are marked"
+            )
+        self.grid = self._marked(verts, bits, reach, total) if grid is None else grid
+
+    def _marked(self, verts: Tensor, bits: Tensor, reach: Tensor, total: int) -> Tensor:
+        from .kernels.launch import launch, view
+        from .kernels.shell import splat_bodies
+
+        self.grid = torch.zeros(total, dtype=torch.int32, device=verts.device)
         args = [view(verts, 3), view(bits), view(reach), *self._grid_args()]
         launch(splat_bodies, verts.shape[0], args, verts, smallest=2)
+        return self.grid
 
     def _grid_args(self) -> list:
         from .kernels.launch import view

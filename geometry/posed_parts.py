@@ -88,6 +88,7 @@ class PosedParts:
         canonical: PosedBody,
         parts: PartMap,
         radius: float | Float[Tensor, "k"] = 0.05,
+        shell: BodyShell | None = None,
     ) -> None:
         """Build shells, search trees and blended maps.
 
@@ -97,9 +98,10 @@ class PosedParts:
             canonical: one body in the canonical pose.
             parts: the part of each joint.
             radius: metres; a point farther than this from a part's surface does not belong to it.
+            shell: the shell of these bodies where a caller has one, of the same radius and parts.
 
         Raises:
-            InputError: the body has no UVs.
+            InputError: the body has no UVs, or the shell is of another number of bodies.
         """
         if body.uv is None:
             raise InputError("body: expected UV coordinates, found none; unwrap the body first")
@@ -110,7 +112,12 @@ class PosedParts:
         self.num_parts = len(parts.names)
         radii = torch.as_tensor(radius, dtype=torch.float32, device=verts.device)
         self.radius = radii.expand(self.num_parts).contiguous()
-        self.shell = BodyShell(verts, self.faces, self.radius, self.face_part)
+        self.shell = shell or BodyShell(verts, self.faces, self.radius, self.face_part)
+        if len(self.shell.lo) != len(verts):
+            raise InputError(
+                f"shell: expected {len(verts)} bodies, found {len(self.shell.lo)}; build it from "
+                "the vertices of these bodies"
+            )
         self.corner_uv = body.uv.corner_uv.to(verts).contiguous()
         weights = body.weights.to(verts)
         flat = posed.transforms.detach().reshape(-1, body.num_joints, 4, 4).to(verts)

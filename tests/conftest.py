@@ -2,6 +2,7 @@
 
 import os
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -14,6 +15,14 @@ ROOT = Path(__file__).resolve().parents[1]
 hypothesis.settings.register_profile("house", derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile("house")
 torch.set_num_threads(min(2, os.cpu_count() or 1))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _cache_of_the_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Tests do not touch the cache of the user."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MONOPART_CACHE", str(tmp_path_factory.mktemp("monopart_cache")))
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -19,7 +19,11 @@ from .presets import preset, preset_names
 PROGRAM = """Animatable avatars from monocular video.
 
 CAPTURE is a folder in the layout of ZJU-MoCap; RUN is a folder that training makes. Results go to
-stdout, progress to stderr. Bad input: one line and exit code 2; interrupt: 130."""
+stdout, progress to stderr. Bad input: one line and exit code 2; interrupt: 130.
+
+What takes long to prepare is kept in ~/.cache/monopart/frames (XDG_CACHE_HOME is heeded), at most
+in 4 GB. MONOPART_CACHE names another folder, or "off"; MONOPART_CACHE_GB another limit; monopart
+info tells where it is and how large."""
 SPLITS = ("novel_view", "novel_pose")
 OF_PRESET = "(default: the preset's)"
 
@@ -137,14 +141,26 @@ class Render:
     """Folder of the capture, if it has moved."""
     explain: bool = False
     """Print a table of the rays, samples and part evaluations that were skipped."""
+    coarse: Count = 1
+    """Look at every N-th sample of a ray first and fill in where there is something; 1 is exact."""
+    half: bool = False
+    """Run the networks in float16 (for GPUs: slower on a CPU)."""
 
     def run(self) -> None:
         """Do it."""
         check_file("--out", self.out, ".png")
+        check_count("--coarse", self.coarse)
         from . import commands
 
         commands.render(
-            self.run_folder, self.camera, self.frame, self.out, self.capture, self.explain
+            self.run_folder,
+            self.camera,
+            self.frame,
+            self.out,
+            self.capture,
+            self.explain,
+            coarse=self.coarse,
+            half=self.half,
         )
 
 

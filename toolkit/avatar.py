@@ -8,10 +8,12 @@ from monopart.geometry.body import BodyPose, PosedBody
 from monopart.geometry.cameras import Camera
 from monopart.geometry.posed_parts import PosedParts
 
+from .cache import NO_CACHE, Cache
 from .captures.records import CaptureRecord
 from .config import Config
 from .memory import PoseMemory
 from .model import AvatarModel, FrameInput
+from .prepared import distance_prior
 from .scene import SceneBodies, canonical_body, stack_poses
 
 
@@ -25,6 +27,7 @@ class Avatar:
         canonical: the body in the canonical pose.
         memory: poses of the training frames.
         model: the learned part.
+        cache: where geometry and images that take long to prepare are kept.
     """
 
     record: CaptureRecord
@@ -32,19 +35,23 @@ class Avatar:
     canonical: PosedBody
     memory: PoseMemory
     model: AvatarModel
+    cache: Cache = NO_CACHE
 
     @classmethod
-    def create(cls, record: CaptureRecord, config: Config) -> "Avatar":
+    def create(cls, record: CaptureRecord, config: Config, cache: Cache = NO_CACHE) -> "Avatar":
         """An untrained avatar of a capture, from the global random state."""
         frames = record.split("train").frames
         canonical = canonical_body(record)
         poses = torch.stack([record.poses[f].pose for f in frames])
-        model = AvatarModel(config, record.body, canonical, len(frames))
-        return cls(record, config, canonical, PoseMemory.build(frames, poses), model)
+        prior = None
+        if config.field.prior_slope:
+            prior = distance_prior(canonical.verts, record.body.faces, cache)
+        model = AvatarModel(config, record.body, canonical, len(frames), prior)
+        return cls(record, config, canonical, PoseMemory.build(frames, poses), model, cache)
 
     def scene(self, frames: tuple[int, ...]) -> SceneBodies:
         """Posed bodies of frames of the capture."""
-        return SceneBodies.build(self.record, frames, self.config, self.canonical)
+        return SceneBodies.build(self.record, frames, self.config, self.canonical, self.cache)
 
     def canonical_parts(self) -> PosedParts:
         """Search structures of the canonical body."""

@@ -16,7 +16,9 @@ from monopart.geometry.errors import InputError
 
 from .animate import as_uint8, pose_of, turntable_views
 from .avatar import Avatar, View
+from .cache import user_cache
 from .captures import check_capture, describe, read_capture
+from .captures.cache import read_pictures
 from .config import Config
 from .explain import print_skipping, why_empty
 from .progress import counted, progress_bar
@@ -133,16 +135,22 @@ def _trained(
         config, params = resumable(out)
     else:
         check_free(out)
-    with stages.timed("reading and body geometry"), progress_bar("Reading") as update:
-        record = read_capture(capture, params=params)
-        check_capture(record, deep=True)
+    with stages.timed("reading and body geometry"), progress_bar("Reading", True) as update:
+        record, cache = read_capture(capture, params=params), user_cache(say)
+        pictures = read_pictures(
+            record, "train", cache, lambda i, n: update(0.6 * i / n, f"image {i}/{n}")
+        )
+        check_capture(record, deep=True, masks=pictures.masks)
         run = out if resume else create_run(out, config, record)
         torch.manual_seed(config.seed)
-        avatar = Avatar.create(record, config)
-        trainer = Trainer(avatar, run, counted(update))
+        update(0.6, "canonical body")
+        avatar = Avatar.create(record, config, cache)
+        update(0.8, "posed bodies")
+        trainer = Trainer(avatar, run, pictures=pictures)
         if resume:
             load_state(trainer, run)
             say(f"going on from step {trainer.result.iterations}")
+        update(1.0, "")
     with stages.timed("kernels (compiled once per machine)"):
         trainer.warm_up()
     say(f"{record.name}: training preset {config.preset} on {len(trainer.body_of_image)} images")
@@ -218,7 +226,14 @@ def _training_facts(path: Path) -> tuple[TrainResult, dict[str, float]]:
 
 
 def render(
-    run: Path, camera: str, frame: int, out: Path, capture: Path | None, explain: bool
+    run: Path,
+    camera: str,
+    frame: int,
+    out: Path,
+    capture: Path | None,
+    explain: bool,
+    coarse: int = 1,
+    half: bool = False,
 ) -> None:
     """Render one camera at one frame of the capture.
 
@@ -229,12 +244,14 @@ def render(
         out: picture to write.
         capture: the capture, if it has moved.
         explain: print the table of what was skipped.
+        coarse: samples of a ray per coarse one; 1 is exact.
+        half: run the networks in float16.
     """
     avatar = open_run(run, capture)
     index = avatar.record.camera_index(camera)
     view = View(avatar.record.cameras[index], pose_of(avatar.record, frame), frame)
     start = time.perf_counter()
-    picture = render_view(avatar, view)
+    picture = render_view(avatar, view, coarse=coarse, half=half)
     took = time.perf_counter() - start
     save_png(out, as_uint8(picture.color))
     why = why_empty(avatar, view, picture)
@@ -302,4 +319,5 @@ def info(path: Path) -> None:
     else:
         record = read_capture(path)
         facts = describe(record) | {"check": dataclasses.asdict(check_capture(record, deep=True))}
+    facts["cache"] = user_cache(say).facts()
     print(json.dumps(facts, indent=2, default=str))

@@ -116,6 +116,9 @@ class TrainConfig:
     """Learning rate of networks and codes."""
     lr_final: float = 0.03
     """Factor of both rates at the end, reached exponentially."""
+    sparse_optimizer: bool = False
+    """Step only the rows of the hash tables that received a gradient (approximate); pays where
+    `field.log2_size` is 19 or more."""
     ema: float = 0.98
     """Decay of the weights' moving average that is rendered and saved; 0 switches it off."""
     random_background: bool = True

@@ -18,6 +18,7 @@ from torch.nn import functional as F
 
 from monopart.geometry.errors import InputError
 
+from .lpips_taps import PackedTaps, can_pack
 from .lpips_weights import ENV_NAME, STAGE_WIDTHS, expected_shapes, find_lpips_weights
 
 ValueRange = Literal["[-1,1]", "[0,1]"]
@@ -61,6 +62,7 @@ class LPIPS(torch.nn.Module):
         self.register_buffer("shift", torch.tensor(_SHIFT), persistent=False)
         self.register_buffer("scale", torch.tensor(_SCALE), persistent=False)
         self._black: dict[tuple[object, ...], list[Tensor]] = {}
+        self._packed: PackedTaps | None = None
 
     def forward(
         self,
@@ -142,8 +144,8 @@ class LPIPS(torch.nn.Module):
             return self._differences(ours, target_features or ())
         if torch.is_grad_enabled() and pred.requires_grad and not target.requires_grad:
             with torch.no_grad():  # in one batch the backward pass would run for the target too
-                theirs = self.features(target, value_range=value_range)
-            return self._differences(self.features(pred, value_range=value_range), theirs)
+                theirs = self._training_features(target, value_range)
+            return self._differences(self._training_features(pred, value_range), theirs)
         if skip_black:
             with torch.no_grad():
                 box = _skippable_box(pred, target)
@@ -152,6 +154,18 @@ class LPIPS(torch.nn.Module):
         pair = torch.stack([pred, target])
         taps = self._taps(self._prepared(pair, value_range))
         return tuple(self._difference(i, *_unit(tap).chunk(2)) for i, tap in enumerate(taps))
+
+    def _training_features(self, images: Tensor, value_range: ValueRange) -> tuple[Tensor, ...]:
+        """`features` for patches of one size again and again; differentiable once."""
+        x = self._prepared(images, value_range)
+        if not can_pack(self.shift):
+            return tuple(_unit(tap) for tap in self._taps(x))
+        size = (x.shape[0], x.shape[2], x.shape[3])
+        if self._packed is None or self._packed.size != size:
+            names = [f"conv_{i}" for i in range(sum(map(len, STAGE_WIDTHS)))]
+            pairs = [(self.get_buffer(f"{n}_weight"), self.get_buffer(f"{n}_bias")) for n in names]
+            self._packed = PackedTaps(pairs, [len(widths) for widths in STAGE_WIDTHS], size)
+        return tuple(_unit(tap) for tap in self._packed(x))
 
     def _prepared(self, images: Tensor, value_range: ValueRange) -> Tensor:
         """Images *b H W 3 in [0, 1] to the network's input n 3 H W, channels last."""

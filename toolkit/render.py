@@ -1,14 +1,17 @@
 """Pictures of an avatar, in chunks of rays; what a picture does not need is skipped."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from monopart.fields.mlp import PartMLP
 from monopart.geometry.cameras import Rays
+from monopart.geometry.errors import InputError
 
 from .avatar import Avatar, View
 from .march import march
@@ -51,6 +54,8 @@ def render_view(
     prune: float = 0.0,
     skip: bool = True,
     scene: SceneBodies | None = None,
+    coarse: int = 1,
+    half: bool = False,
 ) -> Picture:
     """Render one view.
 
@@ -64,7 +69,46 @@ def render_view(
             opaque front (within 5e-5); off evaluates every part at every sample in the box of the
             body: the dense renderer, for comparison.
         scene: the posed body if it exists already.
+        coarse: see :func:`march` (approximate); 1 is exact.
+        half: run the networks in float16 (approximate).
+
+    Raises:
+        InputError: coarse below 1, or above it together with ``skip=False``.
     """
+    if coarse < 1 or (coarse > 1 and not skip):
+        raise InputError(f"coarse: expected 1, or more together with skip, found {coarse}")
+    with half_networks(avatar.model, half):
+        return _render_view(avatar, view, background, prune, skip, scene, coarse)
+
+
+@contextmanager
+def half_networks(model: torch.nn.Module, on: bool = True) -> Iterator[None]:
+    """Networks that compute in float16 inside the block; parameters stay as they are.
+
+    Args:
+        model: a module with :class:`PartMLP` inside.
+        on: off changes nothing.
+    """
+    networks = [m for m in model.modules() if isinstance(m, PartMLP)] if on else []
+    before = [network.compute for network in networks]
+    for network in networks:
+        network.compute = torch.float16
+    try:
+        yield
+    finally:
+        for network, kind in zip(networks, before, strict=True):
+            network.compute = kind
+
+
+def _render_view(
+    avatar: Avatar,
+    view: View,
+    background: float,
+    prune: float,
+    skip: bool,
+    scene: SceneBodies | None,
+    coarse: int,
+) -> Picture:
     model = avatar.model.eval()
     scene = scene or avatar.pose_scene(view.pose)
     inputs = avatar.frame_input(view.frame, view.pose)
@@ -84,7 +128,7 @@ def render_view(
         part = slice(start, start + CHUNK)
         chunk = Rays(rays.origins[part], rays.directions[part])
         if skip:
-            out = march(model, bodies, inputs, chunk, prune)
+            out = march(model, bodies, inputs, chunk, prune, coarse)
         else:
             out = model.render_rays(bodies, inputs, chunk, 0, None, prune)
         color[index[part]] = out.color

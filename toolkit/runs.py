@@ -10,6 +10,7 @@ from monopart.geometry.errors import InputError
 
 from .atomic import write_json, write_text
 from .avatar import Avatar
+from .cache import user_cache
 from .captures import read_capture
 from .captures.records import CaptureRecord
 from .checkpoint import WEIGHTS, load_weights
@@ -148,7 +149,7 @@ def open_run(run: Path, capture: Path | None = None) -> Avatar:
         )
     record = read_capture(capture, params=params)
     torch.manual_seed(config.seed)
-    avatar = Avatar.create(record, config)
+    avatar = Avatar.create(record, config, user_cache())
     load_weights(avatar.model, run)
     avatar.model.eval()
     return avatar

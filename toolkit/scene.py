@@ -11,8 +11,10 @@ from monopart.geometry.cameras import Camera, Rays
 from monopart.geometry.parts import PartMap
 from monopart.geometry.posed_parts import PosedParts
 
+from .cache import NO_CACHE, Cache
 from .captures.records import CaptureRecord
 from .config import Config
+from .prepared import body_shell
 
 
 def stack_poses(poses: list[BodyPose]) -> BodyPose:
@@ -38,11 +40,16 @@ class SceneBodies:
 
     @classmethod
     def build(
-        cls, record: CaptureRecord, frames: tuple[int, ...], config: Config, canonical: PosedBody
+        cls,
+        record: CaptureRecord,
+        frames: tuple[int, ...],
+        config: Config,
+        canonical: PosedBody,
+        cache: Cache = NO_CACHE,
     ) -> "SceneBodies":
-        """Pose the bodies of frames of a capture."""
+        """Pose the bodies of frames of a capture; their shells come from the cache or go there."""
         poses = stack_poses([record.poses[f] for f in frames])
-        return cls.of_poses(record, poses, frames, config, canonical)
+        return cls.of_poses(record, poses, frames, config, canonical, cache)
 
     @classmethod
     def of_poses(
@@ -52,13 +59,15 @@ class SceneBodies:
         frames: tuple[int, ...],
         config: Config,
         canonical: PosedBody,
+        cache: Cache = NO_CACHE,
     ) -> "SceneBodies":
         """Pose the body of a capture with given poses, batched."""
         body, spec = record.body, config.geometry
         with torch.no_grad():
             posed = body(poses)
             table = PartMap.preset(spec.parts, body.num_joints)
-            parts = PosedParts(body, posed, canonical, table, spec.radius)
+            shell = body_shell(body, posed, table, spec, cache)
+            parts = PosedParts(body, posed, canonical, table, spec.radius, shell)
         return cls(posed, parts, frames)
 
     def local_rays(self, rays: Rays, body: Tensor | int) -> Rays:

@@ -17,12 +17,13 @@ from monopart.geometry.consistency import consistency_loss
 from monopart.geometry.errors import MonopartError
 
 from .avatar import Avatar
+from .captures.cache import Pictures, read_pictures
 from .captures.patches import PixelBatch, PixelSampler
 from .checkpoint import save_weights
-from .config import Config
 from .losses import color_loss, offset_loss, round_trip_distance
 from .lpips import LPIPS, load_lpips
 from .model import Rendered
+from .optimizer import make_optimizer
 from .resume import forget_state, save_state
 
 MAX_BAD_STEPS = 20  # non-finite losses in a row after which a run ends
@@ -59,6 +60,7 @@ class Trainer:
         avatar: Avatar,
         run: Path | None = None,
         progress: Callable[[int, int], None] | None = None,
+        pictures: Pictures | None = None,
     ) -> None:
         """Read the images and pose the bodies, once.
 
@@ -66,12 +68,13 @@ class Trainer:
             avatar: the avatar to train.
             run: folder for train.jsonl and checkpoints; None writes nothing.
             progress: called with (done, total) as images are read.
+            pictures: the training images where a caller has read them already.
         """
         self.avatar, self.run_folder = avatar, run
         self.config = avatar.config
         train = avatar.record.split("train")
-        images, masks = avatar.record.stack("train", progress)
-        self.sampler = PixelSampler(images, masks, self.config.train.band)
+        seen = pictures or read_pictures(avatar.record, "train", avatar.cache, progress)
+        self.sampler = PixelSampler(seen.images, seen.masks, self.config.train.band)
         self.scene = avatar.scene(train.frames)
         self.body_of_image = torch.tensor([train.frames.index(f) for _, f in train.pairs()])
         self.camera_of_image = torch.tensor([train.cameras.index(c) for c, _ in train.pairs()])
@@ -304,17 +307,6 @@ class Trainer:
         }
         with (self.run_folder / "train.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
-
-
-def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam:
-    """Adam with the rates of hash tables and of everything else."""
-    tables = [p for n, p in model.named_parameters() if n.endswith("grid.table")]
-    others = [p for n, p in model.named_parameters() if not n.endswith("grid.table")]
-    groups = [
-        {"params": tables, "base_lr": config.train.lr_table},
-        {"params": others, "base_lr": config.train.lr_network},
-    ]
-    return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
 def _joined(a: PixelBatch, b: PixelBatch) -> PixelBatch:

@@ -75,3 +75,14 @@ def test_the_grid_moves_with_the_module_but_is_not_saved() -> None:
 def test_bad_input(reach: float, cell: float) -> None:
     with pytest.raises(InputError, match="reach, cell"):
         DistancePrior(*sphere(0.2), reach=reach, cell=cell)
+
+
+def test_kept_values_give_the_same_prior() -> None:
+    verts, faces = sphere(0.2)
+    built = DistancePrior(verts, faces, 0.1, 0.05)
+    again = DistancePrior(verts, faces, 0.1, 0.05, built.values[0, 0])
+    points = torch.randn(200, 3) * 0.3
+    assert torch.equal(built(points), again(points))
+    for wrong in (built.values[0, 0, 1:], built.values[0, 0].double()):
+        with pytest.raises(InputError, match="values"):
+            DistancePrior(verts, faces, 0.1, 0.05, wrong)

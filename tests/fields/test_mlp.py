@@ -109,3 +109,14 @@ def test_frequency_encoding():
         encode(torch.zeros(1, 2))
     with pytest.raises(InputError, match="one column"):
         FrequencyEncoding(3, 0, include_raw=False)
+
+
+def test_products_in_half_precision_are_near_and_keep_the_type():
+    mlp = PartMLP(2, (8, 16, 3))
+    x = torch.rand(9, 8)
+    exact = mlp(x, (4, 5))
+    mlp.compute = torch.float16
+    found = mlp(x, (4, 5))
+    assert found.dtype == torch.float32
+    assert 0 < float((found - exact).detach().abs().max()) < 5e-3
+    assert mlp(x[:0], (0, 0)).dtype == torch.float32

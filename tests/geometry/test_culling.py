@@ -8,7 +8,7 @@ import torch
 
 from monopart.geometry.body import BodyModel, BodyPose
 from monopart.geometry.cameras import Rays
-from monopart.geometry.culling import BodyShell
+from monopart.geometry.culling import BodyShell, _vertex_reach
 from monopart.geometry.errors import InputError
 from monopart.geometry.parts import PartMap
 from monopart.geometry.surface import SurfaceIndex
@@ -251,3 +251,27 @@ def test_bad_input() -> None:
     shell = BodyShell(verts, faces, 0.1)
     with pytest.raises(InputError, match="step"):
         shell.sample(Rays(verts, verts), 0.0)
+
+
+def test_a_kept_grid_must_fit(shell: BodyShell) -> None:
+    verts = posed_verts(2)
+    built = BodyShell(verts, BODY.faces, 0.05)
+    again = BodyShell(verts, BODY.faces, 0.05, grid=built.grid)
+    points = around(verts[0], 500, 0.2)
+    assert torch.equal(built.bits(points), again.bits(points))
+    assert torch.equal(built.lo, again.lo) and torch.equal(built.offset, again.offset)
+    for wrong in (built.grid[1:], built.grid.long(), shell.grid[:0]):
+        with pytest.raises(InputError, match="grid"):
+            BodyShell(verts, BODY.faces, 0.05, grid=wrong)
+
+
+def test_the_reach_of_a_vertex_is_that_of_its_longest_edge() -> None:
+    """Against a loop over the faces of every body."""
+    verts, faces = posed_verts(2), BODY.faces.long()
+    longest = torch.zeros(len(verts[0]))
+    for body in verts:
+        corners = body[faces]
+        edge = torch.stack([(corners[:, i] - corners[:, i - 1]).norm(dim=-1) for i in range(3)])
+        for corner in range(3):
+            longest.scatter_reduce_(0, faces[:, corner], edge.amax(0), "amax")
+    torch.testing.assert_close(_vertex_reach(verts, faces), longest / 3**0.5, rtol=1e-6, atol=1e-8)

@@ -8,7 +8,7 @@ import torch
 from monopart.geometry.body import BodyModel, BodyPose, PosedBody
 from monopart.geometry.cameras import Rays
 from monopart.geometry.consistency import consistency_loss, round_trip
-from monopart.geometry.culling import ShellSamples
+from monopart.geometry.culling import BodyShell, ShellSamples
 from monopart.geometry.errors import InputError
 from monopart.geometry.parts import PartMap
 from monopart.geometry.posed_parts import PartHit, PartPairs, PosedParts, RestPoints
@@ -265,3 +265,14 @@ def test_a_part_that_no_face_belongs_to() -> None:
 def test_a_body_without_uv_is_refused() -> None:
     with pytest.raises(InputError, match="UV"):
         PosedParts(dataclasses.replace(BODY, uv=None), CANONICAL, CANONICAL, PARTS)
+
+
+def test_a_kept_shell_gives_the_same_samples(batch: Batch) -> None:
+    parts, samples, pairs, _ = batch
+    kept = BodyShell(parts.verts, BODY.faces, RADIUS, FACE_PART, grid=parts.shell.grid)
+    again = ask(PosedParts(BODY, BODY(poses()), CANONICAL, PARTS, RADIUS, kept))
+    assert torch.equal(again[1].points, samples.points)
+    assert torch.equal(again[1].candidates, samples.candidates)
+    assert torch.equal(again[2].face, pairs.face)
+    with pytest.raises(InputError, match="shell: expected 1 bodies, found 3"):
+        PosedParts(BODY, CANONICAL, CANONICAL, PARTS, RADIUS, kept)

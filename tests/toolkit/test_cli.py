@@ -140,7 +140,7 @@ def test_demo_needs_its_capture(tmp_path, capsys, monkeypatch):
 def test_render_and_turntable(trained_run, tmp_path, capsys):
     picture, film = tmp_path / "a.png", tmp_path / "a.mp4"
     argv = ["render", trained_run, "--camera", "Camera_B2", "--frame", "3", "--out", picture]
-    assert cli.main([str(a) for a in (*argv, "--explain")]) is None
+    assert cli.main([str(a) for a in (*argv, "--explain", "--coarse", "2", "--half")]) is None
     seen = capsys.readouterr()
     assert seen.out == f"{picture}\n"
     assert "rendering: rays" in seen.err and "What was skipped" in seen.err
@@ -155,6 +155,10 @@ def test_info(trained_run, small_capture, capsys):
     assert cli.main(["info", str(small_capture)]) is None
     facts = json.loads(capsys.readouterr().out)
     assert facts["image_size"] == [48, 48] and facts["check"]["images"] == 3
+    cache = facts["cache"]
+    assert (
+        cache["folder"] == os.environ["MONOPART_CACHE"] and cache["entries"] >= 2
+    )  # images and shells; the tiny run has no prior
     assert cli.main(["info", str(trained_run)]) is None
     facts = json.loads(capsys.readouterr().out)
     assert facts["config"]["train"]["rays"] == 128 and "novel_view" in facts["metrics"]

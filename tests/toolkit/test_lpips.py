@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from monopart.geometry.errors import InputError
+from monopart.geometry.errors import BackendError, InputError
 from monopart.toolkit import lpips as module
 from monopart.toolkit import lpips_weights
 from monopart.toolkit.lpips import LPIPS, average_maps, load_lpips, upsample_maps
@@ -186,6 +186,29 @@ def test_gradient_agrees_with_differences():
     with torch.no_grad():
         difference = (net(a + step * direction, b) - net(a - step * direction, b)) / (2 * step)
     assert (slope * direction).sum().item() == pytest.approx(difference.item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("size", [(64, 64), (1, 16, 16), (2, 37, 50)])
+def test_weights_laid_out_once_change_nothing(net, monkeypatch, size):
+    """The path of training against the plain one, in value and gradient."""
+    target, found = picture(*size, seed=5), []
+    for can in (module.can_pack, lambda like: False):
+        monkeypatch.setattr(module, "can_pack", can)
+        pred = picture(*size, seed=6).requires_grad_()
+        value = net(pred, target)
+        value.sum().backward()
+        found.append((value.detach(), pred.grad))
+    (value, grad), (plain_value, plain_grad) = found
+    torch.testing.assert_close(value, plain_value, rtol=1e-5, atol=1e-6)
+    assert float((grad - plain_grad).abs().max()) < 1e-5 * float(plain_grad.abs().max())
+
+
+def test_the_packed_network_refuses_a_second_derivative(net):
+    if not module.can_pack(net.shift):
+        pytest.skip("torch without oneDNN")
+    pred = picture(16, 16).requires_grad_()
+    with pytest.raises(BackendError, match="second derivative"):
+        torch.autograd.grad(net(pred, picture(16, 16, seed=1)), pred, create_graph=True)
 
 
 @pytest.mark.parametrize("dead", [True, False])

@@ -1,16 +1,19 @@
 """The avatar model: exact skipping, gradients everywhere, determinism."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 from miniature import write_miniature
 
-from monopart.geometry.errors import MonopartError
+from monopart.geometry.errors import InputError, MonopartError
 from monopart.toolkit.avatar import Avatar, view_of
 from monopart.toolkit.captures import read_capture
 from monopart.toolkit.checkpoint import load_weights, save_weights
 from monopart.toolkit.config import Config
+from monopart.toolkit.optimizer import make_optimizer
 from monopart.toolkit.presets import preset, with_overrides
 from monopart.toolkit.render import render_view
 from monopart.toolkit.train import Trainer
@@ -58,6 +61,29 @@ def test_learned_pruning_changes_the_image_little_and_evaluates_less(capture: Pa
     exact, pruned = render_view(avatar, view), render_view(avatar, view, prune=1e-3)
     assert pruned.stats["pairs_evaluated"] < exact.stats["pairs_evaluated"]
     assert float((exact.color - pruned.color).abs().mean()) < 2e-3
+
+
+def test_coarse_to_fine_changes_the_image_little_and_evaluates_less(trained: Avatar) -> None:
+    view = view_of(trained.record, 0, 0)
+    exact = render_view(trained, view)
+    assert torch.equal(render_view(trained, view, coarse=1).color, exact.color)
+    for factor in (2, 4):
+        found = render_view(trained, view, coarse=factor)
+        assert found.stats["samples_evaluated"] < exact.stats["samples_evaluated"]
+        assert float((exact.color - found.color).abs().max()) < 2e-2
+        assert float((exact.color - found.color).abs().mean()) < 1e-3
+    with pytest.raises(InputError, match="coarse"):
+        render_view(trained, view, coarse=2, skip=False)
+    with pytest.raises(InputError, match="coarse"):
+        render_view(trained, view, coarse=0)
+
+
+def test_half_networks_change_the_image_little_and_leave_the_model(trained: Avatar) -> None:
+    view = view_of(trained.record, 0, 0)
+    exact, found = render_view(trained, view), render_view(trained, view, half=True)
+    largest = float((exact.color - found.color).abs().max())
+    assert 0 < largest < 2e-2
+    assert torch.equal(render_view(trained, view).color, exact.color)
 
 
 def test_the_untrained_avatar_is_already_a_person(capture: Path) -> None:
@@ -133,6 +159,26 @@ def test_other_part_tables_train(capture: Path, parts: str) -> None:
     assert bool(render_view(avatar, view_of(avatar.record, 0, 0)).color.isfinite().all())
 
 
+def test_the_sparse_optimizer_learns_and_keeps_the_gradient_buffers(capture: Path) -> None:
+    first = {}
+    for sparse in (False, True):
+        avatar = make(capture, small(train={"sparse_optimizer": sparse, "ema": 0.0}))
+        trainer = Trainer(avatar)
+        trainer.warm_up()
+        trainer.step(0, 0.0)
+        first[sparse] = {k: v.detach().clone() for k, v in avatar.model.named_parameters()}
+    for name, value in first[False].items():  # in the first step no row has missed one
+        torch.testing.assert_close(value, first[True][name], rtol=1e-4, atol=1e-4)
+    table = avatar.model.field.grid.table
+    place = table.grad.data_ptr()
+    before = trainer.last["mse"]
+    for step in range(1, 10):
+        trainer.step(step, 0.0)
+    assert trainer.last["mse"] < before
+    assert table.grad.data_ptr() == place
+    assert not table.grad.any()
+
+
 def test_warming_up_changes_nothing(capture: Path) -> None:
     avatar = make(capture, small())
     trainer = Trainer(avatar)
@@ -158,3 +204,53 @@ def test_a_loss_that_is_not_finite_is_skipped_and_named(
     with pytest.raises(MonopartError, match="mse"):
         for step in range(1, 30):
             trainer.step(step, 0.0)
+
+
+def test_the_optimiser_is_adam_of_torch(capture: Path) -> None:
+    config = small(field={"prior_slope": 0.0})
+    ours, theirs = make(capture, config).model, make(capture, config).model
+    mine = make_optimizer(ours, config)
+    groups = [
+        {"params": [dict(theirs.named_parameters())[n] for n in names], "lr": 1e-3}
+        for names in (
+            [n for n, _ in ours.named_parameters() if n.endswith("grid.table")],
+            [n for n, _ in ours.named_parameters() if not n.endswith("grid.table")],
+        )
+    ]
+    reference = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
+    for step in range(4):
+        for a, b in zip(ours.parameters(), theirs.parameters(), strict=True):
+            a.grad = torch.randn(a.shape)
+            b.grad = a.grad.clone()
+        if step == 2:
+            mine.load_state_dict(mine.state_dict())
+        mine.step()
+        reference.step()
+        assert all(
+            torch.equal(a, b) for a, b in zip(ours.parameters(), theirs.parameters(), strict=True)
+        )
+    mine.zero_grad(set_to_none=True)
+    assert all(p.grad is None for p in ours.parameters())
+
+
+def test_training_does_not_import_torch_compile(capture: Path) -> None:
+    """It takes over a second, at every start, and nothing here uses it."""
+    code = (
+        "import sys, pathlib, dataclasses, torch\n"
+        "torch.set_num_threads(1)\n"
+        "from monopart.toolkit.avatar import Avatar\n"
+        "from monopart.toolkit.captures import read_capture\n"
+        "from monopart.toolkit.presets import preset, with_overrides\n"
+        "from monopart.toolkit.train import Trainer\n"
+        "config = with_overrides(preset('fast'), train={'iterations': 2, 'rays': 32},"
+        " field={'prior_slope': 0.0, 'log2_size': 8})\n"
+        "Trainer(Avatar.create(read_capture(pathlib.Path(sys.argv[1])), config)).loop()\n"
+        "assert 'torch._dynamo' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code, str(capture)], check=True)
+
+
+def test_voxels_are_those_of_the_configuration(capture: Path) -> None:
+    avatar = make(capture, small(geometry={"voxel": 0.04}, field={"prior_slope": 0.0}))
+    assert avatar.scene((0, 1)).parts.shell.voxel == 0.04
+    assert avatar.pose_scene(avatar.record.poses[0]).parts.shell.voxel == 0.04

@@ -1,5 +1,7 @@
 """Training batches against the images they come from."""
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -56,3 +58,21 @@ def test_the_same_generator_gives_the_same_batch(sampler: PixelSampler) -> None:
     a = sampler.random(50, torch.Generator().manual_seed(3))
     b = sampler.random(50, torch.Generator().manual_seed(3))
     assert torch.equal(a.pixels, b.pixels)
+
+
+@pytest.mark.parametrize("band", [0, 1, 3, 14, 60])
+def test_the_grown_masks_are_those_of_the_whole_images(sampler: PixelSampler, band: int) -> None:
+    found = PixelSampler(sampler.images, sampler.masks, band)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band + 1, 2 * band + 1))
+    whole = [np.flatnonzero(cv2.dilate(m.numpy().astype(np.uint8), kernel)) for m in sampler.masks]
+    assert found.pixel.tolist() == np.concatenate(whole).tolist()
+    assert found.end.tolist() == np.cumsum([len(w) for w in whole]).tolist()
+    assert found.pixel.dtype == torch.int32
+
+
+def test_an_empty_mask_has_no_pixels(sampler: PixelSampler) -> None:
+    masks = sampler.masks.clone()
+    masks[1] = False
+    found = PixelSampler(sampler.images, masks, 3)
+    assert int(found.end[1]) == int(found.end[0])
+    assert set(found.random(500, torch.Generator().manual_seed(0)).image.tolist()) == {0, 2}

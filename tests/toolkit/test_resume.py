@@ -25,10 +25,11 @@ SMALL = with_overrides(
 )
 
 
-def trainer(capture: Path, run: Path) -> Trainer:
+def trainer(capture: Path, run: Path, sparse: bool = False) -> Trainer:
     run.mkdir(exist_ok=True)
     torch.manual_seed(0)
-    return Trainer(Avatar.create(read_capture(capture), SMALL), run)
+    config = with_overrides(SMALL, train={"sparse_optimizer": sparse})
+    return Trainer(Avatar.create(read_capture(capture), config), run)
 
 
 @pytest.fixture(scope="module")
@@ -40,13 +41,14 @@ class _Died(Exception):
     pass
 
 
+@pytest.mark.parametrize("sparse", [False, True])
 def test_a_resumed_run_equals_an_unbroken_one(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sparse: bool
 ) -> None:
-    whole = trainer(capture, tmp_path / "whole")
+    whole = trainer(capture, tmp_path / "whole", sparse)
     whole.loop()
 
-    broken = trainer(capture, tmp_path / "broken")
+    broken = trainer(capture, tmp_path / "broken", sparse)
     step = broken.step
 
     def dying(number: int, done: float) -> dict[str, float]:
@@ -60,7 +62,7 @@ def test_a_resumed_run_equals_an_unbroken_one(
     with pytest.raises(_Died):
         broken.loop()
 
-    again = trainer(capture, tmp_path / "broken")
+    again = trainer(capture, tmp_path / "broken", sparse)
     load_state(again, tmp_path / "broken")
     assert again.result.iterations == 4
     again.loop()
@@ -88,6 +90,8 @@ def test_states_that_do_not_fit_are_refused(capture: Path, tmp_path: Path) -> No
     wrong = Trainer(Avatar.create(read_capture(capture), other), run)
     with pytest.raises(InputError, match="difference"):
         load_state(wrong, run)
+    with pytest.raises(InputError, match="difference"):
+        load_state(trainer(capture, run, sparse=True), run)
 
 
 def test_resume_on_the_command_line(

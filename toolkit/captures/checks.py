@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from monopart.geometry.errors import InputError
@@ -36,7 +36,10 @@ class CaptureCheck:
 
 
 def check_capture(
-    record: CaptureRecord, deep: bool = False, progress: Progress | None = None
+    record: CaptureRecord,
+    deep: bool = False,
+    progress: Progress | None = None,
+    masks: Bool[Tensor, "n h w"] | None = None,
 ) -> CaptureCheck:
     """Look for what would spoil a training run.
 
@@ -45,6 +48,8 @@ def check_capture(
         deep: also open every training image and mask (readable, of one size, mask not empty), and
             compare the first frame's body with the stored vertices and the mask.
         progress: called with (done, total) after each image.
+        masks: masks of the training images where a caller has read them already; no image is then
+            opened again.
 
     Returns:
         What was looked at and measured.
@@ -62,15 +67,18 @@ def check_capture(
     pairs = record.split("train").pairs()
     covered = [0.0] * len(pairs)
 
+    def mask_of(i: int) -> Tensor:
+        return record.mask(*pairs[i]) if masks is None else masks[i]
+
     def look(i: int) -> None:
-        covered[i] = _coverage(record, pairs[i])
+        covered[i] = _coverage(record, pairs[i], mask_of(i))
 
     run_all(look, len(pairs), progress)
     return CaptureCheck(
         images=len(pairs),
         files=files,
         vertex_error=_vertex_error(record),
-        on_mask=_on_mask(record, pairs[0]),
+        on_mask=_on_mask(record, pairs[0], mask_of(0)),
         coverage=sum(covered) / len(covered),
     )
 
@@ -144,9 +152,8 @@ def _check_files(record: CaptureRecord, pair: tuple[int, int]) -> None:
             )
 
 
-def _coverage(record: CaptureRecord, pair: tuple[int, int]) -> float:
+def _coverage(record: CaptureRecord, pair: tuple[int, int], on: Tensor) -> float:
     """Share of one training image that is mask; refuses none."""
-    on = record.mask(*pair)
     check_not_empty(record, pair, on)
     return float(on.to(torch.float32).mean())
 
@@ -172,9 +179,9 @@ def _vertex_error(record: CaptureRecord) -> float | None:
     return error
 
 
-def _on_mask(record: CaptureRecord, pair: tuple[int, int]) -> float:
+def _on_mask(record: CaptureRecord, pair: tuple[int, int], on: Tensor) -> float:
     """Share of the body's vertices that fall on the mask."""
-    camera, on = record.cameras[pair[0]], record.mask(*pair)
+    camera = record.cameras[pair[0]]
     verts = _verts_world(record, pair[1])
     pixels, _ = camera.project(verts)
     seen = camera.visible(verts)

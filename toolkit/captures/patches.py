@@ -41,12 +41,11 @@ class PixelSampler:
         """
         self.images, self.masks = images, masks
         self.height, self.width = masks.shape[1:]
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band + 1, 2 * band + 1))
-        grown = [np.flatnonzero(cv2.dilate(m.numpy().astype(np.uint8), kernel)) for m in masks]
-        self.pixel = torch.from_numpy(np.concatenate(grown).astype(np.int32))
+        self.boxes = [mask_box(m) for m in masks]
+        grown = [_grown(m.numpy(), box, band) for m, box in zip(masks, self.boxes, strict=True)]
+        self.pixel = torch.from_numpy(np.concatenate(grown))
         counts = torch.tensor([len(g) for g in grown])
         self.end = counts.cumsum(0)
-        self.boxes = [_box(m) for m in masks]
 
     def random(self, count: int, generator: torch.Generator) -> PixelBatch:
         """Uniformly random pixels of all images, in order: neighbours share the body's memory."""
@@ -78,6 +77,28 @@ class PixelSampler:
         return PixelBatch(image, torch.stack([x, y], -1).float() + 0.5, color, mask)
 
 
-def _box(mask: Tensor) -> tuple[int, int, int, int]:
-    rows, columns = torch.nonzero(mask.any(1)), torch.nonzero(mask.any(0))
+def mask_box(mask: Bool[Tensor, "h w"]) -> tuple[int, int, int, int]:
+    """Top, bottom, left and right of the box around a mask, ends excluded.
+
+    Args:
+        mask: the mask.
+
+    Returns:
+        Rows and columns; zeros where the mask is empty.
+    """
+    rows, columns = (np.flatnonzero(mask.numpy().any(axis=a)) for a in (1, 0))
+    if not len(rows):
+        return 0, 0, 0, 0
     return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+
+
+def _grown(mask: np.ndarray, box: tuple[int, int, int, int], band: int) -> np.ndarray:
+    """Flat indices of a mask grown by a band, ascending, int32; looks only where the mask is."""
+    top, left = max(box[0] - band, 0), max(box[2] - band, 0)
+    near = mask[top : box[1] + band, left : box[3] + band].astype(np.uint8)
+    if not near.size:
+        return np.zeros(0, np.int32)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band + 1, 2 * band + 1))
+    inside = np.flatnonzero(cv2.dilate(near, kernel).view(bool))
+    skipped = (inside // near.shape[1]) * (mask.shape[1] - near.shape[1])
+    return (inside + skipped + top * mask.shape[1] + left).astype(np.int32)

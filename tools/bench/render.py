@@ -10,6 +10,7 @@ from monopart.geometry.errors import InputError
 from .registry import Method, Operation, Problem, Settings
 
 PRUNE = 2e-3
+COARSE = (2, 3, 4)
 VIEWS = 3
 
 
@@ -66,6 +67,7 @@ def _judge(data: ViewData, picture: Any) -> dict[str, float]:
     dense = 64.0 * stats["pixels"]
     return {
         "error": float((picture.color - data.dense.color).abs().max()),
+        "mean error": float((picture.color - data.dense.color).abs().mean()),
         "rays %": 100.0 * stats["rays"] / stats["pixels"],
         "samples % of 64 a pixel": 100.0 * stats["samples_shell"] / dense,
         "pairs evaluated %": 100.0 * stats["pairs_evaluated"] / dense,
@@ -78,6 +80,13 @@ def operations() -> tuple[Operation, ...]:
     methods = (
         Method("exact skipping", _picture(), ours=True),
         Method(f"learned occupancy, {PRUNE}", _picture(prune=PRUNE), ours=True),
+        *(Method(f"coarse to fine, {n}", _picture(coarse=n), ours=True) for n in COARSE),
+        Method(
+            f"learned occupancy, {PRUNE}, and coarse to fine, {COARSE[0]}",
+            _picture(prune=PRUNE, coarse=COARSE[0]),
+            ours=True,
+        ),
+        Method("networks in float16", _picture(half=True), ours=True),
         Method("every ray of the image", _picture(skip=False), ours=True),
     )
     return (

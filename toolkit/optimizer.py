@@ -1,0 +1,108 @@
+"""Adam for an avatar: hash tables and everything else, each at its own rate."""
+
+import inspect
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+
+from monopart.fields.hash_grid import HashGrid
+from monopart.fields.row_adam import AdamRule, RowAdam
+
+from .config import Config
+
+_RULE = AdamRule()
+
+
+class Adam(torch.optim.Adam):
+    """Torch's Adam, bit for bit, without its import of torch.compile, which takes over a second."""
+
+    add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
+    zero_grad = inspect.unwrap(torch.optim.Adam.zero_grad)
+    state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
+    load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
+    step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
+
+
+class SplitAdam:
+    """:class:`RowAdam` for the tables and fused Adam for the rest, seen as one optimiser."""
+
+    def __init__(self, tables: RowAdam, others: torch.optim.Adam) -> None:
+        """Join two optimisers.
+
+        Args:
+            tables: of the hash tables.
+            others: of everything else.
+        """
+        self.tables, self.others = tables, others
+
+    @property
+    def param_groups(self) -> list[dict[str, Any]]:
+        """The groups of both; entries may be set."""
+        return self.tables.param_groups + self.others.param_groups
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Forget the gradients that a step does not consume.
+
+        Args:
+            set_to_none: drop them instead of filling them with zeros.
+        """
+        self.others.zero_grad(set_to_none)
+
+    def step(self) -> None:
+        """One step of both."""
+        self.tables.step()
+        self.others.step()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state of every parameter, numbered through the groups of both."""
+        tables, others = self.tables.state_dict(), self.others.state_dict()
+        count = self._tables()
+        state = tables["state"] | {count + i: v for i, v in others["state"].items()}
+        return {"state": state, "param_groups": tables["param_groups"] + others["param_groups"]}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Put back what :meth:`state_dict` gave.
+
+        Args:
+            state_dict: state and groups.
+
+        Raises:
+            KeyError: the state of another kind of optimiser.
+        """
+        count, groups = self._tables(), state_dict["param_groups"]
+        state, split = state_dict["state"], len(self.tables.param_groups)
+        tables = {i: v for i, v in state.items() if i < count}
+        others = {i - count: v for i, v in state.items() if i >= count}
+        self.tables.load_state_dict({"state": tables, "param_groups": groups[:split]})
+        self.others.load_state_dict({"state": others, "param_groups": groups[split:]})
+
+    def _tables(self) -> int:
+        return sum(len(group["params"]) for group in self.tables.param_groups)
+
+
+def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam | SplitAdam:
+    """Adam with the rates of hash tables and of everything else.
+
+    Args:
+        model: an avatar's model; its hash grids are told how to hand over their gradients.
+        config: rates, and whether tables are stepped row by row.
+    """
+    sparse = config.train.sparse_optimizer
+    for grid in _grids(model):
+        grid.accumulate = sparse
+    tables = [p for n, p in model.named_parameters() if n.endswith("grid.table")]
+    others = [p for n, p in model.named_parameters() if not n.endswith("grid.table")]
+    groups = [
+        {"params": tables, "base_lr": config.train.lr_table},
+        {"params": others, "base_lr": config.train.lr_network},
+    ]
+    rule: Any = {"betas": _RULE.betas, "eps": _RULE.eps}
+    if not sparse:
+        return Adam(groups, lr=1e-3, fused=True, **rule)
+    others_only = Adam(groups[1:], lr=1e-3, fused=True, **rule)
+    return SplitAdam(RowAdam(groups[:1], rule=_RULE), others_only)
+
+
+def _grids(model: torch.nn.Module) -> Iterator[HashGrid]:
+    return (m for m in model.modules() if isinstance(m, HashGrid))
