@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .body import BodyModel
@@ -34,6 +34,10 @@ class FieldPoint:
     linear: Float[Tensor, "n 3 3"]
     corner_images: Float[Tensor, "n 3 3"]
     triangles: Float[Tensor, "n 3 3"]
+
+    def jacobian(self) -> Float[Tensor, "n 3 3"]:
+        """The Jacobian of the image in the points, see `field_jacobian`."""
+        return field_jacobian(self)
 
 
 def vertex_maps(
@@ -183,6 +187,33 @@ class SkinningField:
         corners = self.faces[face]
         first, second, third = (self.weights[corners[:, k]] for k in range(3))
         return first * bary[:, :1] + second * bary[:, 1:2] + third * bary[:, 2:]
+
+    def maps(self, transforms: Float[Tensor, "J 4 4"]) -> Float[Tensor, "m 3 4"]:
+        """Blended maps that `at` mixes: those of the vertices. Differentiable."""
+        return vertex_maps(transforms, self.weights)
+
+    def search(
+        self, points: Float[Tensor, "n 3"], max_distance: float
+    ) -> tuple[Int[Tensor, "n"], Bool[Tensor, "n"]]:
+        """Closest face of rest points, and whether it is within ``max_distance``."""
+        hit = self.index.query(points, max_distance)
+        return hit.face, hit.found
+
+    def at(
+        self,
+        points: Float[Tensor, "n 3"],
+        face: Int[Tensor, "n"],
+        maps: Float[Tensor, "m 3 4"],
+        rest: Float[Tensor, "V 3"] | None = None,
+    ) -> FieldPoint:
+        """The forward field where `search` found ``face``; ``rest`` carries gradients."""
+        return field_at(points, face, self.rest if rest is None else rest, self.faces, maps)
+
+    def weights_on(
+        self, points: Float[Tensor, "n 3"], face: Int[Tensor, "n"], rest: Float[Tensor, "V 3"]
+    ) -> Float[Tensor, "n J"]:
+        """Skinning weights where `search` found ``face``; differentiable in points and rest."""
+        return self.mix(face, closest_on_triangle(points, rest[self.faces[face]]))
 
     def posed_index(self, verts: Float[Tensor, "V 3"]) -> SurfaceIndex:
         """Search structure of the posed surface, refit from pose to pose."""

@@ -14,17 +14,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .body import BodyModel, PosedBody
+from .diffused_weights import DiffusedField, newton_cells
 from .errors import InputError
 from .rigid import append_last_row, apply_linear, invert_linear
 from .skinning import blend_transforms, unskin
-from .skinning_field import SkinningField, field_at, field_jacobian, vertex_maps
-from .surface import closest_on_triangle
+from .skinning_field import SkinningField, vertex_maps
 from .unskin_newton import (
     ARRIVED,
     MIN_DET,
     Bones,
     Plan,
     Roots,
+    guess_warp,
     keep_better,
     newton_torch,
     newton_warp,
@@ -80,7 +81,9 @@ def inverse_skin(
             a first guess, then Newton steps with the analytic Jacobian, one kernel for all).
         rest_verts: shaped rest vertices ``body.shaped(betas)[0]``, or a `SkinningField` that holds
             them and names a back end; None is the mean shape, ``body.v_template``. The search
-            structures of the last shape of a body are kept.
+            structures of the last shape of a body are kept. A `DiffusedField` takes its weights from
+            a grid that extends them smoothly off the surface; points beyond the reach of its grid
+            are not valid, and gradients to its rest vertices are zero.
         max_distance: rest points farther than this from the rest surface are not valid, metres.
         starts: first guesses: one from the posed surface, the others by the inverses of the nearest
             bones. Broyden runs them all and keeps the best; newton and fixed_point try the next
@@ -106,30 +109,77 @@ def inverse_skin(
     [True, True, True, True]
     """
     plan = _plan(method, max_distance, starts, iterations, points.dtype)
+    query = prepare(points, posed, body, rest_verts)
+    found = (_direct if method in ("nearest", "surface") else _iterative)(query, method, plan)
+    return Unskinned(
+        found.points,
+        found.weights,
+        torch.where(query.sound, found.residual, math.inf),
+        found.valid & query.sound,
+    )
+
+
+@dataclass(frozen=True)
+class Query:
+    """Checked input of a search.
+
+    Attributes:
+        points: [N, 3] targets in pose space; those that are not finite are replaced.
+        posed: the body; numbers that are not finite are replaced.
+        field: the forward field.
+        rest: [V, 3] rest vertices, as tensors that gradients go to.
+        sound: [N] whether nothing was replaced.
+    """
+
+    points: Float[Tensor, "n 3"]
+    posed: PosedBody
+    field: SkinningField
+    rest: Float[Tensor, "V 3"]
+    sound: Bool[Tensor, "n"]
+
+    @property
+    def fast(self) -> bool:
+        """Whether the Warp solvers serve it."""
+        return self.field.backend == "warp" and self.points.dtype == torch.float32
+
+    def bones(self) -> Bones:
+        """Rigid inverses as first guesses, detached."""
+        return Bones.of(self.posed.joints.detach(), self.posed.transforms.detach())
+
+
+def prepare(
+    points: Float[Tensor, "n 3"],
+    posed: PosedBody,
+    body: BodyModel,
+    rest_verts: Float[Tensor, "V 3"] | SkinningField | None,
+) -> Query:
+    """Check the input of a search and mask what is not finite.
+
+    Args:
+        points: targets in pose space, metres.
+        posed: the body, unbatched.
+        body: its model.
+        rest_verts: as in `inverse_skin`.
+
+    Returns:
+        The query.
+
+    Raises:
+        InputError: batched body, tensors that do not fit together.
+    """
     field, rest = _field(points, posed, body, rest_verts)
     with torch.no_grad():
-        sound = points.isfinite().all(-1) & posed.transforms.isfinite().all()
-        sound = sound & posed.verts.isfinite().all()
+        whole = posed.transforms.isfinite().all()
+        sound = points.isfinite().all(-1) & whole & posed.verts.isfinite().all()
     identity = torch.eye(4, dtype=points.dtype, device=points.device)
     # one bad number would spread through the search structures: such input is replaced, then masked
-    whole = posed.transforms.isfinite().all()
     posed = replace(
         posed,
         transforms=torch.where(whole, posed.transforms, identity),
         verts=torch.where(posed.verts.isfinite(), posed.verts, 0.0),
         joints=torch.where(posed.joints.isfinite(), posed.joints, 0.0),
     )
-    targets = torch.where(sound[:, None], points, 0.0)
-    if method in ("nearest", "surface"):
-        found = _direct(targets, posed, field, method, plan)
-    else:
-        found = _iterative(targets, posed, field, rest, method, plan)
-    return Unskinned(
-        found.points,
-        found.weights,
-        torch.where(sound, found.residual, math.inf),
-        found.valid & sound,
-    )
+    return Query(torch.where(sound[:, None], points, 0.0), posed, field, rest, sound)
 
 
 def _plan(
@@ -178,10 +228,9 @@ def _field(
     return kept, rest
 
 
-def _direct(
-    points: Tensor, posed: PosedBody, field: SkinningField, method: str, plan: Plan
-) -> Unskinned:
+def _direct(query: Query, method: str, plan: Plan) -> Unskinned:
     """One look-up of the weights on the posed body, one inverse."""
+    points, posed, field = query.points, query.posed, query.field
     if method == "nearest":
         weights = field.weights[_nearest_vertex(points, posed.verts)]
     else:
@@ -189,10 +238,10 @@ def _direct(
         weights = field.mix(hit.face, hit.bary)
     rest, ok = unskin(points, blend_transforms(posed.transforms, weights), MIN_DET)
     with torch.no_grad():
-        maps = vertex_maps(posed.transforms, field.weights)
-        hit = field.index.query(rest.detach(), plan.max_distance)
-        image = field_at(rest, hit.face, field.rest, field.faces, maps).image
-        residual = torch.where(hit.found, (image - points).norm(dim=-1), math.inf)
+        maps = field.maps(posed.transforms)
+        face, near = field.search(rest.detach(), plan.max_distance)
+        image = field.at(rest, face, maps).image
+        residual = torch.where(near, (image - points).norm(dim=-1), math.inf)
     return Unskinned(rest, weights, residual, ok & (residual <= ARRIVED))
 
 
@@ -203,67 +252,122 @@ def _nearest_vertex(points: Tensor, verts: Tensor) -> Tensor:
     return torch.cat(parts)
 
 
-def _iterative(
-    points: Tensor, posed: PosedBody, field: SkinningField, rest: Tensor, method: str, plan: Plan
-) -> Unskinned:
+def _iterative(query: Query, method: str, plan: Plan) -> Unskinned:
     """Search without gradients, then attach them at the solution."""
-    maps = vertex_maps(posed.transforms, field.weights)
+    maps = query.field.maps(query.posed.transforms)
     with torch.no_grad():
-        x, still = points.detach(), maps.detach()
-        bones = Bones.of(posed.joints.detach(), posed.transforms.detach())
-        weights = None
-        if method == "newton" and field.backend == "warp" and x.dtype == torch.float32:
-            roots, weights = newton_warp(field, x, still, bones, plan)
+        x, still, bones = query.points.detach(), maps.detach(), query.bones()
+        if method == "newton" and query.fast:
+            roots, weights = solve(query, still, bones, plan, None)
         else:
-            guess = _surface_guess(x, posed, field)
-            roots = _search(method, field, x, still, bones, plan, guess)
-            weights = _weights(field, roots.points, roots.face, field.rest)
-            weights = weights * roots.residual.isfinite()[:, None]
+            roots = _search(method, query, still, bones, plan)
+            weights = weights_of(query, roots)
         valid = roots.invertible & (roots.residual <= ARRIVED)
+    moved, weights = attach(query, maps, roots, weights, valid)
+    return Unskinned(moved, weights, roots.residual, valid)
+
+
+def solve(
+    query: Query,
+    maps: Float[Tensor, "m 3 4"],
+    bones: Bones,
+    plan: Plan,
+    guess: Float[Tensor, "n 3"] | None,
+) -> tuple[Roots, Float[Tensor, "n J"]]:
+    """Run the Warp solver of the field.
+
+    Args:
+        query: targets and field, float32.
+        maps: ``field.maps`` of the pose, detached.
+        bones: for the starts after the first.
+        plan: how to search.
+        guess: first rest points; None looks them up.
+
+    Returns:
+        The roots and their weights [N, J].
+    """
+    field, points = query.field, query.points.detach()
+    if not isinstance(field, DiffusedField):
+        return newton_warp(field, points, maps, bones, plan, guess)
+    if guess is None:
+        verts_maps = vertex_maps(query.posed.transforms.detach(), field.weights)
+        guess, _ = guess_warp(field, points, verts_maps, plan.max_distance)
+    return newton_cells(field, points, maps, bones, plan, guess)
+
+
+def weights_of(query: Query, roots: Roots) -> Float[Tensor, "n J"]:
+    """Skinning weights of roots.
+
+    Args:
+        query: gives the field.
+        roots: found by a search without weights.
+
+    Returns:
+        Weights [N, J], zeros where nothing was within reach.
+    """
+    weights = query.field.weights_on(roots.points, roots.face, query.field.rest)
+    return weights * roots.residual.isfinite()[:, None]
+
+
+def attach(
+    query: Query,
+    maps: Float[Tensor, "m 3 4"],
+    roots: Roots,
+    weights: Float[Tensor, "n J"],
+    valid: Bool[Tensor, "n"],
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n J"]]:
+    """Give roots the derivatives of the implicit function theorem.
+
+    Args:
+        query: targets and field.
+        maps: ``field.maps`` of the pose, not detached.
+        roots: where the search ended.
+        weights: their skinning weights.
+        valid: elsewhere no gradient flows.
+
+    Returns:
+        Rest points and weights, equal in value.
+    """
+    points, field, rest = query.points, query.field, query.rest
     wanted = points.requires_grad or maps.requires_grad or rest.requires_grad
     if not (torch.is_grad_enabled() and wanted):
-        return Unskinned(roots.points, weights, roots.residual, valid)
-    at = field_at(roots.points, roots.face, rest, field.faces, maps)
-    inverse, ok = invert_linear(field_jacobian(at).detach(), MIN_DET)
+        return roots.points, weights
+    at = field.at(roots.points, roots.face, maps, rest)
+    inverse, ok = invert_linear(at.jacobian().detach(), MIN_DET)
     # p - J^-1 (f(p) - x) with p and J held: its first derivatives are those of the root
     step = apply_linear(inverse, points - at.image)
     step = torch.where((ok & valid)[:, None], step - step.detach(), 0.0)
     moved = roots.points + step
-    exact = _weights(field, moved, roots.face, rest)
-    weights = weights + torch.where((ok & valid)[:, None], exact - exact.detach(), 0.0)
-    return Unskinned(moved, weights, roots.residual, valid)
+    exact = field.weights_on(moved, roots.face, rest)
+    return moved, weights + torch.where((ok & valid)[:, None], exact - exact.detach(), 0.0)
 
 
-def _weights(field: SkinningField, points: Tensor, face: Tensor, rest: Tensor) -> Tensor:
-    return field.mix(face, closest_on_triangle(points, rest[field.faces[face]]))
+def surface_guess(query: Query) -> Float[Tensor, "n 3"]:
+    """First rest points: the result of the method "surface".
 
+    Args:
+        query: targets and posed body.
 
-def _surface_guess(points: Tensor, posed: PosedBody, field: SkinningField) -> Tensor:
-    """The result of the method "surface"."""
+    Returns:
+        Rest points, detached.
+    """
+    field, points, posed = query.field, query.points.detach(), query.posed
     hit = field.posed_index(posed.verts.detach()).query(points)
     maps = vertex_maps(posed.transforms.detach(), field.weights)
     blended = (maps[field.faces[hit.face]] * hit.bary[..., None, None]).sum(1)
     return unskin(points, append_last_row(blended), MIN_DET)[0]
 
 
-def _search(
-    method: str,
-    field: SkinningField,
-    points: Tensor,
-    maps: Tensor,
-    bones: Bones,
-    plan: Plan,
-    guess: Tensor,
-) -> Roots:
+def _search(method: str, query: Query, maps: Tensor, bones: Bones, plan: Plan) -> Roots:
+    guess, points = surface_guess(query), query.points.detach()
     if method != "broyden":
-        fast = field.backend == "warp" and points.dtype == torch.float32
-        if fast:
-            return newton_warp(field, points, maps, bones, plan, guess.contiguous())[0]
-        return newton_torch(field, points, maps, bones, plan, guess)
+        if query.fast:
+            return solve(query, maps, bones, plan, guess.contiguous())[0]
+        return newton_torch(query.field, points, maps, bones, plan, guess)
     best = nowhere(guess)
     for start in range(min(plan.starts, bones.joints.shape[0] + 1)):
         first = guess if start == 0 else bones.guess(points, start - 1)
-        best = keep_better(best, _broyden(field, points, maps, plan, first))
+        best = keep_better(best, _broyden(query.field, points, maps, plan, first))
     return best
 
 
@@ -279,17 +383,17 @@ def _broyden(
     rows = torch.arange(len(points), device=points.device)
     rest, inverse, move, error = guess, None, None, None
     for step in range(plan.iterations + 1):
-        hit = field.index.query(rest, plan.max_distance)
-        at = field_at(rest, hit.face, field.rest, field.faces, maps)
+        face, found = field.search(rest, plan.max_distance)
+        at = field.at(rest, face, maps)
         new_error = at.image - points[rows]
-        residual = torch.where(hit.found, new_error.norm(dim=-1), math.inf)
+        residual = torch.where(found, new_error.norm(dim=-1), math.inf)
         start_inverse, ok = invert_linear(at.linear, MIN_DET)
-        _store(best, rows, Roots(rest, hit.face, residual, ok))
+        _store(best, rows, Roots(rest, face, residual, ok))
         if inverse is None or move is None or error is None:
             inverse = start_inverse
         else:
             inverse = _rank_one(inverse, move, new_error - error)
-        go = hit.found & (residual > plan.stop)
+        go = found & (residual > plan.stop)
         if step == plan.iterations or not bool(go.any()):
             break
         rows, inverse, error = rows[go], inverse[go], new_error[go]

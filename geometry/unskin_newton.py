@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .face_tree import LIMIT
 from .rigid import apply_linear, invert_affine, invert_linear
-from .skinning_field import SkinningField, field_at, field_jacobian
+from .skinning_field import SkinningField
 
 MIN_DET = 1e-2  # a map with a smaller |determinant| has no inverse worth having
 ARRIVED = 1e-3  # metres: a residual up to this counts as a root
@@ -123,8 +123,16 @@ def guess_warp(
     return guess, hint
 
 
-def _by_voxel(points: Tensor, rest: Tensor) -> Tensor:
-    """Order in which neighbours follow each other: the look-ups then hit warm memory."""
+def by_voxel(points: Float[Tensor, "n 3"], rest: Float[Tensor, "V 3"]) -> Int[Tensor, "n"]:
+    """Order in which neighbours follow each other: the look-ups then hit warm memory.
+
+    Args:
+        points: rest points.
+        rest: rest vertices; their box is cut into voxels.
+
+    Returns:
+        Rows of the points, voxel after voxel.
+    """
     low = rest.amin(0) - _MARGIN
     voxel = ((rest.amax(0) + _MARGIN - low) / _ORDER).clamp(min=1e-6)
     cell = ((points - low) / voxel).clamp(0, _ORDER - 1).int()
@@ -167,7 +175,7 @@ def newton_warp(
     residual = torch.empty(count, device=device)
     invertible = torch.empty(count, dtype=torch.bool, device=device)
     limits = (plan.stop, ARRIVED, MIN_DET, min(plan.max_distance, LIMIT))
-    order = _by_voxel(guess, field.rest)
+    order = by_voxel(guess, field.rest)
     args = [view(order), view(points, 3), view(guess, 3), view(hint)]
     args += [view(field.index.tree.places), *field.index.tree.args()]
     args += [view(field.rest.detach().contiguous(), 3), view(field.faces32, 3)]
@@ -182,7 +190,7 @@ def newton_warp(
 def newton_torch(
     field: SkinningField,
     points: Float[Tensor, "n 3"],
-    maps: Float[Tensor, "V 3 4"],
+    maps: Float[Tensor, "m 3 4"],
     bones: Bones,
     plan: Plan,
     guess: Float[Tensor, "n 3"],
@@ -192,7 +200,7 @@ def newton_torch(
     Args:
         field: the forward field.
         points: targets in pose space, finite.
-        maps: blended maps of the vertices.
+        maps: ``field.maps`` of the pose.
         bones: for the starts after the first.
         plan: how to search.
         guess: first rest points.
@@ -215,18 +223,18 @@ def _descend(
     """One start: Newton steps (or re-queries) that keep the best iterate."""
     rest, best, last = guess, nowhere(guess), torch.inf
     for step in range(plan.iterations + 1):
-        hit = field.index.query(rest, plan.max_distance)
-        at = field_at(rest, hit.face, field.rest, field.faces, maps)
+        face, found = field.search(rest, plan.max_distance)
+        at = field.at(rest, face, maps)
         error = points - at.image
-        residual = torch.where(hit.found, error.norm(dim=-1), math.inf)
+        residual = torch.where(found, error.norm(dim=-1), math.inf)
         better, last = residual < last, residual
         inverse, ok = invert_linear(at.linear, MIN_DET)
-        best = keep_better(best, Roots(rest, hit.face, residual, ok))
-        active = hit.found & (best.residual > plan.stop)
+        best = keep_better(best, Roots(rest, face, residual, ok))
+        active = found & (best.residual > plan.stop)
         if step == plan.iterations or not bool(active.any()):
             break
         if plan.gradients:
-            full, regular = invert_linear(field_jacobian(at), MIN_DET)
+            full, regular = invert_linear(at.jacobian(), MIN_DET)
             regular = regular & better  # after a step that did not help: re-query only
             inverse = torch.where(regular[:, None, None], full, inverse)
             ok = ok | regular
