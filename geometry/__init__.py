@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .consistency import round_trip as round_trip
     from .culling import BodyShell as BodyShell
     from .culling import ShellSamples as ShellSamples
+    from .diffused_weights import DiffusedField as DiffusedField
     from .errors import BackendError as BackendError
     from .errors import InputError as InputError
     from .errors import MonopartError as MonopartError
@@ -57,6 +58,8 @@ if TYPE_CHECKING:
     from .surface import vertex_normals as vertex_normals
     from .unskin import Unskinned as Unskinned
     from .unskin import inverse_skin as inverse_skin
+    from .unskin_roots import UnskinnedRoots as UnskinnedRoots
+    from .unskin_roots import inverse_skin_all as inverse_skin_all
     from .uv import UVMap as UVMap
 
 _ROOM = {
@@ -65,6 +68,7 @@ _ROOM = {
     "BodyPose": "body",
     "BodyShell": "culling",
     "Camera": "cameras",
+    "DiffusedField": "diffused_weights",
     "InputError": "errors",
     "KinematicTree": "kinematics",
     "MonopartError": "errors",
@@ -80,6 +84,7 @@ _ROOM = {
     "SurfaceIndex": "surface",
     "UVMap": "uv",
     "Unskinned": "unskin",
+    "UnskinnedRoots": "unskin_roots",
     "axis_angle_to_rotmat": "rotations",
     "blend_skin": "skinning",
     "blend_transforms": "skinning",
@@ -91,6 +96,7 @@ _ROOM = {
     "forward_kinematics": "kinematics",
     "in_box": "boxes",
     "inverse_skin": "unskin",
+    "inverse_skin_all": "unskin_roots",
     "invert_affine": "rigid",
     "orbit_cameras": "cameras",
     "quat_wxyz_to_rotmat": "rotations",

@@ -19,6 +19,7 @@ from .errors import InputError
 from .rigid import append_last_row, apply_linear, invert_linear
 from .skinning import blend_transforms, unskin
 from .skinning_field import SkinningField, vertex_maps
+from .unskin_broyden import broyden
 from .unskin_newton import (
     ARRIVED,
     MIN_DET,
@@ -81,9 +82,9 @@ def inverse_skin(
             a first guess, then Newton steps with the analytic Jacobian, one kernel for all).
         rest_verts: shaped rest vertices ``body.shaped(betas)[0]``, or a `SkinningField` that holds
             them and names a back end; None is the mean shape, ``body.v_template``. The search
-            structures of the last shape of a body are kept. A `DiffusedField` takes its weights from
-            a grid that extends them smoothly off the surface; points beyond the reach of its grid
-            are not valid, and gradients to its rest vertices are zero.
+            structures of the last shape of a body are kept. A `DiffusedField` takes weights from a
+            grid that extends them smoothly off the surface; points beyond the reach of its grid are
+            not valid, and gradients to its rest vertices are zero.
         max_distance: rest points farther than this from the rest surface are not valid, metres.
         starts: first guesses: one from the posed surface, the others by the inverses of the nearest
             bones. Broyden runs them all and keeps the best; newton and fixed_point try the next
@@ -108,7 +109,7 @@ def inverse_skin(
     >>> found.valid.tolist()
     [True, True, True, True]
     """
-    plan = _plan(method, max_distance, starts, iterations, points.dtype)
+    plan = plan_of(method, max_distance, starts, iterations, points.dtype)
     query = prepare(points, posed, body, rest_verts)
     found = (_direct if method in ("nearest", "surface") else _iterative)(query, method, plan)
     return Unskinned(
@@ -182,9 +183,24 @@ def prepare(
     return Query(torch.where(sound[:, None], points, 0.0), posed, field, rest, sound)
 
 
-def _plan(
+def plan_of(
     method: str, max_distance: float, starts: int | None, iterations: int | None, dtype: torch.dtype
 ) -> Plan:
+    """Check how to search, and fill in what a method has as its default.
+
+    Args:
+        method: as in `inverse_skin`.
+        max_distance: reach of the rest surface, metres.
+        starts: first guesses, or None.
+        iterations: steps of one start, or None.
+        dtype: of the targets; decides when a residual is small enough.
+
+    Returns:
+        The plan.
+
+    Raises:
+        InputError: unknown method, or a limit out of range.
+    """
     if method not in _ITERATIONS:
         raise InputError(f"method: expected one of {', '.join(_ITERATIONS)}, found {method!r}")
     starts = _STARTS[method] if starts is None else starts
@@ -256,7 +272,7 @@ def _iterative(query: Query, method: str, plan: Plan) -> Unskinned:
     """Search without gradients, then attach them at the solution."""
     maps = query.field.maps(query.posed.transforms)
     with torch.no_grad():
-        x, still, bones = query.points.detach(), maps.detach(), query.bones()
+        still, bones = maps.detach(), query.bones()
         if method == "newton" and query.fast:
             roots, weights = solve(query, still, bones, plan, None)
         else:
@@ -367,57 +383,5 @@ def _search(method: str, query: Query, maps: Tensor, bones: Bones, plan: Plan) -
     best = nowhere(guess)
     for start in range(min(plan.starts, bones.joints.shape[0] + 1)):
         first = guess if start == 0 else bones.guess(points, start - 1)
-        best = keep_better(best, _broyden(query.field, points, maps, plan, first))
+        best = keep_better(best, broyden(query.field, points, maps, plan, first))
     return best
-
-
-def _broyden(
-    field: SkinningField, points: Tensor, maps: Tensor, plan: Plan, guess: Tensor
-) -> Roots:
-    """Broyden's method from one start; points that arrived leave the batch.
-
-    Reference: C. G. Broyden, A class of methods for solving nonlinear simultaneous equations, 1965
-    (the inverse form, by Sherman and Morrison).
-    """
-    best = nowhere(guess)
-    rows = torch.arange(len(points), device=points.device)
-    rest, inverse, move, error = guess, None, None, None
-    for step in range(plan.iterations + 1):
-        face, found = field.search(rest, plan.max_distance)
-        at = field.at(rest, face, maps)
-        new_error = at.image - points[rows]
-        residual = torch.where(found, new_error.norm(dim=-1), math.inf)
-        start_inverse, ok = invert_linear(at.linear, MIN_DET)
-        _store(best, rows, Roots(rest, face, residual, ok))
-        if inverse is None or move is None or error is None:
-            inverse = start_inverse
-        else:
-            inverse = _rank_one(inverse, move, new_error - error)
-        go = found & (residual > plan.stop)
-        if step == plan.iterations or not bool(go.any()):
-            break
-        rows, inverse, error = rows[go], inverse[go], new_error[go]
-        move = -apply_linear(inverse, error)
-        move = move * (0.2 / move.norm(dim=-1, keepdim=True).clamp(min=0.2))
-        rest = rest[go] + move
-    return best
-
-
-def _rank_one(inverse: Tensor, move: Tensor, change: Tensor) -> Tensor:
-    """Smallest change of an inverse Jacobian that explains the last step, where defined."""
-    guess = apply_linear(inverse, change)
-    left = apply_linear(inverse.mT, move)
-    scale = (move * guess).sum(-1)
-    safe = scale.abs() > 1e-3 * move.square().sum(-1)
-    gain = torch.where(safe, 1.0, 0.0) / torch.where(safe, scale, 1.0)
-    return inverse + (move - guess)[:, :, None] * left[:, None, :] * gain[:, None, None]
-
-
-def _store(best: Roots, rows: Tensor, new: Roots) -> None:
-    """Write what is better into the best roots, in place."""
-    take = new.residual < best.residual[rows]
-    rows = rows[take]
-    best.face[rows] = new.face[take]
-    best.residual[rows] = new.residual[take]
-    best.invertible[rows] = new.invertible[take]
-    best.points[rows] = new.points[take]
