@@ -101,11 +101,14 @@ class DiffusedField(SkinningField):
         """The field of a body as in `DiffusedField(...)`; that of its last shape is kept."""
         rest = body.v_template if rest_verts is None else rest_verts.detach()
         asked = (voxel, reach, backend)
-        options, field = _KEPT.get(body, (None, None))
-        same = field is not None and options == asked and field.rest.dtype == rest.dtype
-        if not (same and field.rest.device == rest.device and torch.equal(field.rest, rest)):
-            field = cls(body, rest.clone(), backend, voxel=voxel, reach=reach)
-            _KEPT[body] = (asked, field)
+        kept = _KEPT.get(body)
+        if kept is not None and kept[0] == asked:
+            old = kept[1].rest
+            alike = old.dtype == rest.dtype and old.device == rest.device
+            if alike and torch.equal(old, rest):
+                return kept[1]
+        field = DiffusedField(body, rest.clone(), backend, voxel=voxel, reach=reach)
+        _KEPT[body] = (asked, field)
         return field
 
     def weights_at(
@@ -131,7 +134,7 @@ class DiffusedField(SkinningField):
             gap = self.grid.mix(cell, self.grid.shares(points)[0], self.grid.distance[:, None])
         return cell, found & (gap[:, 0] <= max_distance)
 
-    def at(
+    def at(  # pyright: ignore[reportIncompatibleMethodOverride] - both have jacobian()
         self,
         points: Float[Tensor, "n 3"],
         face: Int[Tensor, "n"],

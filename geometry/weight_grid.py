@@ -117,7 +117,8 @@ def _level(surface: SurfaceIndex, weights: Tensor, voxel: float, reach: float) -
     verts = surface.verts.detach()
     low = verts.amin(0) - reach - voxel
     extent = ((verts.amax(0) + reach + voxel - low) / voxel).ceil().clamp(max=1e9)
-    size = tuple(int(n) + 1 for n in extent.tolist())
+    nx, ny, nz = (int(n) + 1 for n in extent.tolist())
+    size = (nx, ny, nz)
     if math.prod(size) > _MOST:
         raise InputError(
             f"voxel: expected a grid of at most {_MOST} places, found {size[0]} x {size[1]} x "
@@ -129,14 +130,17 @@ def _level(surface: SurfaceIndex, weights: Tensor, voxel: float, reach: float) -
     points = low + voxel * _position(place, size).to(low)
     hit = surface.query(points)
     corners = surface.faces[hit.face]
-    values = sum(weights[corners[:, k]] * hit.bary[:, k : k + 1] for k in range(3))
+    values = weights[corners[:, 0]] * hit.bary[:, :1]
+    for k in (1, 2):
+        values = values + weights[corners[:, k]] * hit.bary[:, k : k + 1]
     cells = torch.stack([node[place + s] for s in _corner_steps(size)], 1)
     cells = cells[(cells >= 0).all(1)]
     slots = torch.full_like(node, -1)
     slots[place[cells[:, 0].long()]] = torch.arange(
         len(cells), dtype=torch.int32, device=low.device
     )
-    lo = tuple(low.tolist())
+    x, y, z = low.tolist()
+    lo = (x, y, z)
     grid = WeightGrid(lo, size, voxel, slots, cells, values.contiguous(), hit.distance)
     free = hit.distance > math.sqrt(3) * voxel
     _start_from_coarse(surface, weights, grid, points, free, reach)

@@ -8,6 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -188,7 +189,7 @@ def _timed_step(trainer: Trainer, step: tuple[int, float]) -> list[Span]:
 
 
 @contextmanager
-def _operators() -> Iterator[torch.autograd.profiler.profile]:
+def _operators() -> Iterator[Any]:
     # Its library prints a line on stderr at each start and stop below this level.
     os.environ.setdefault("KINETO_LOG_LEVEL", "6")
     with torch.autograd.profiler.profile() as found:
@@ -219,9 +220,7 @@ def _traced_step(trainer: Trainer, step: tuple[int, float]) -> tuple[dict[str, f
     return _backward_shares(seen, own), sorted(events, key=lambda e: (e.start, -e.duration))
 
 
-def _backward_shares(
-    seen: Sequence[torch.autograd.profiler_util.FunctionEvent], stages: set[str]
-) -> dict[str, float]:
+def _backward_shares(seen: Sequence[Any], stages: set[str]) -> dict[str, float]:
     """Part of the backward pass that belongs to each stage of the forward pass.
 
     An operator and the node that it leaves in the graph carry the same number; the last operator of

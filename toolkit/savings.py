@@ -170,7 +170,7 @@ def _saving(kind: str, on: _Run, off: _Run) -> Saving:
 class _ForwardToo(AvatarModel):
     """A model that also computes the round trip of every pair, which rendering has no use for."""
 
-    bodies_at_rest: list[PosedParts]
+    bodies_at_rest: PosedParts
 
     def shade(
         self,
@@ -185,14 +185,14 @@ class _ForwardToo(AvatarModel):
         nothing = torch.zeros(0)
         out = Rendered(torch.zeros(0, 3), nothing, nothing, {}, samples, shaded)
         rows = torch.arange(len(shaded.pairs.sample))
-        round_trip_distance(self, bodies, self.bodies_at_rest[0], frames, out, rows)
+        round_trip_distance(self, bodies, self.bodies_at_rest, frames, out, rows)
         return shaded
 
 
 def _with_forward(avatar: Avatar) -> Avatar:
     model = copy.copy(avatar.model)
     model.__class__ = _ForwardToo
-    model.bodies_at_rest = [avatar.canonical_parts()]
+    object.__setattr__(model, "bodies_at_rest", avatar.canonical_parts())
     return dataclasses.replace(avatar, model=model)
 
 

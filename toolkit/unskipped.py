@@ -29,7 +29,7 @@ class PartialShell(BodyShell):
         """
         # Not BodyShell.__init__: the voxels are marked already.
         self.__dict__.update(vars(shell if skip.voxels else shell.filled()))
-        self._marked, self._by_part = shell, skip.parts
+        self._whole, self._by_part = shell, skip.parts
 
     def sample(
         self,
@@ -41,7 +41,7 @@ class PartialShell(BodyShell):
         """As `BodyShell.sample`, with the candidates that are asked for."""
         samples = super().sample(rays, step, body, jitter)
         if self._by_part:
-            candidates = self._marked.bits(samples.points, samples.body)
+            candidates = self._whole.bits(samples.points, samples.body)
         else:
             candidates = torch.full_like(samples.candidates, (1 << self.num_parts) - 1)
         return dataclasses.replace(samples, candidates=candidates)

@@ -5,6 +5,7 @@ CPU, and the same text compiles for CUDA. Layout of the arrays: see `monopart.ge
 """
 
 # ruff: noqa: PLR0911 - one return per region of a triangle
+# pyright: reportInvalidTypeForm=false
 
 from typing import Any, no_type_check
 
