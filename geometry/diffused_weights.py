@@ -53,8 +53,15 @@ class CellPoint:
 class DiffusedField(SkinningField):
     """Skinning weights of every point near a rest surface, diffused from it into a grid.
 
-    Continuous off the surface; on it they differ a little from the barycentric weights. Pass one as
-    ``rest_verts`` of `inverse_skin`. The grid is a constant: rest vertices receive no gradient.
+    Continuous off the surface; on it they differ from the barycentric weights, less with a smaller
+    voxel. Measured on the free body, random points of the surface, total variation of the weights
+    (mean, 99th percentile) and shift of posed points in four random poses (the same, mm):
+    voxel 3 cm 0.026, 0.24; 0.46, 5.1; 2 MB. 2 cm 0.014, 0.16; 0.24, 2.8; 8 MB. 1.5 cm 0.010, 0.12;
+    0.15, 1.9; 18 MB. 1 cm 0.005, 0.08; 0.08, 1.1; 60 MB. The worst points are in creases, where two
+    limbs are nearer than two voxels.
+
+    Pass one as ``rest_verts`` of `inverse_skin`. The grid is a constant: rest vertices receive no
+    gradient.
 
     >>> body = BodyModel.default()
     >>> field = DiffusedField.of(body, voxel=0.04)
@@ -102,12 +109,9 @@ class DiffusedField(SkinningField):
         rest = body.v_template if rest_verts is None else rest_verts.detach()
         asked = (voxel, reach, backend)
         kept = _KEPT.get(body)
-        if kept is not None and kept[0] == asked:
-            old = kept[1].rest
-            alike = old.dtype == rest.dtype and old.device == rest.device
-            if alike and torch.equal(old, rest):
-                return kept[1]
-        field = DiffusedField(body, rest.clone(), backend, voxel=voxel, reach=reach)
+        if kept is not None and kept[0] == asked and _same(kept[1].rest, rest):
+            return kept[1]
+        field = cls(body, rest.clone(), backend, voxel=voxel, reach=reach)
         _KEPT[body] = (asked, field)
         return field
 
@@ -134,7 +138,7 @@ class DiffusedField(SkinningField):
             gap = self.grid.mix(cell, self.grid.shares(points)[0], self.grid.distance[:, None])
         return cell, found & (gap[:, 0] <= max_distance)
 
-    def at(  # pyright: ignore[reportIncompatibleMethodOverride] - both have jacobian()
+    def at(
         self,
         points: Float[Tensor, "n 3"],
         face: Int[Tensor, "n"],
@@ -153,6 +157,11 @@ class DiffusedField(SkinningField):
     ) -> Float[Tensor, "n J"]:
         """Weights where `search` found the cell ``face``; differentiable in the points."""
         return self.grid.mix(face, self.grid.shares(points)[0], self.grid.weights)
+
+
+def _same(first: Tensor, second: Tensor) -> bool:
+    alike = first.dtype == second.dtype and first.device == second.device
+    return alike and torch.equal(first, second)
 
 
 def newton_cells(

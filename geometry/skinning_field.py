@@ -7,6 +7,7 @@ So x(p) = A(w(p)) p, A(w) = sum of w_j T_j, has the Jacobian A(w) + sum over cor
 
 import math
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,6 +16,25 @@ from torch import Tensor
 from .body import BodyModel
 from .errors import InputError
 from .surface import SurfaceIndex, closest_on_triangle
+
+
+@runtime_checkable
+class Mapped(Protocol):
+    """What a search needs of the forward field at rest points."""
+
+    @property
+    def image(self) -> Tensor:
+        """[N, 3] posed points, metres."""
+        ...
+
+    @property
+    def linear(self) -> Tensor:
+        """[N, 3, 3] linear part of the blended maps."""
+        ...
+
+    def jacobian(self) -> Float[Tensor, "n 3 3"]:
+        """The Jacobian of the image in the points."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -205,7 +225,7 @@ class SkinningField:
         face: Int[Tensor, "n"],
         maps: Float[Tensor, "m 3 4"],
         rest: Float[Tensor, "V 3"] | None = None,
-    ) -> FieldPoint:
+    ) -> Mapped:
         """The forward field where `search` found ``face``; ``rest`` carries gradients."""
         return field_at(points, face, self.rest if rest is None else rest, self.faces, maps)
 

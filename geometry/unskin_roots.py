@@ -60,7 +60,8 @@ def inverse_skin_all(
         rest_verts: as in `inverse_skin`.
         max_distance: rest points farther than this from the rest surface are not roots, metres.
         starts: first guesses: one from the posed surface, the others by the inverses of the nearest
-            bones.
+            bones. In a fold of the map, as a crease of the armpit, a root 1 to 3 cm from another
+            one may be missed whatever their number.
         apart: roots nearer to each other than this count as one, metres.
         most: roots that are kept of each point, K.
 

@@ -117,12 +117,12 @@ def _level(surface: SurfaceIndex, weights: Tensor, voxel: float, reach: float) -
     verts = surface.verts.detach()
     low = verts.amin(0) - reach - voxel
     extent = ((verts.amax(0) + reach + voxel - low) / voxel).ceil().clamp(max=1e9)
-    nx, ny, nz = (int(n) + 1 for n in extent.tolist())
-    size = (nx, ny, nz)
+    x, y, z = (int(n) + 1 for n in extent.tolist())
+    size = (x, y, z)
     if math.prod(size) > _MOST:
         raise InputError(
-            f"voxel: expected a grid of at most {_MOST} places, found {size[0]} x {size[1]} x "
-            f"{size[2]}; use a larger voxel (metres)"
+            f"voxel: expected a grid of at most {_MOST} places, found {x} x {y} x {z}; "
+            "use a larger voxel (metres)"
         )
     place = _near_places(surface, low, size, voxel, reach)
     node = torch.full((math.prod(size),), -1, dtype=torch.int32, device=low.device)
@@ -130,21 +130,19 @@ def _level(surface: SurfaceIndex, weights: Tensor, voxel: float, reach: float) -
     points = low + voxel * _position(place, size).to(low)
     hit = surface.query(points)
     corners = surface.faces[hit.face]
-    values = weights[corners[:, 0]] * hit.bary[:, :1]
-    for k in (1, 2):
-        values = values + weights[corners[:, k]] * hit.bary[:, k : k + 1]
+    values = (weights[corners] * hit.bary[..., None]).sum(1)
     cells = torch.stack([node[place + s] for s in _corner_steps(size)], 1)
     cells = cells[(cells >= 0).all(1)]
     slots = torch.full_like(node, -1)
     slots[place[cells[:, 0].long()]] = torch.arange(
         len(cells), dtype=torch.int32, device=low.device
     )
-    x, y, z = low.tolist()
-    lo = (x, y, z)
-    grid = WeightGrid(lo, size, voxel, slots, cells, values.contiguous(), hit.distance)
+    lo = (float(low[0]), float(low[1]), float(low[2]))
+    grid = WeightGrid(lo, size, voxel, slots, cells, values, hit.distance)
     free = hit.distance > math.sqrt(3) * voxel
     _start_from_coarse(surface, weights, grid, points, free, reach)
     _relax(surface.backend, grid, node, place, free)
+    grid.weights.div_(grid.weights.sum(1, keepdim=True))  # sweeps round the sum away from 1
     return grid
 
 
@@ -203,13 +201,10 @@ def _relax(backend: str, grid: WeightGrid, node: Tensor, place: Tensor, free: Te
     neighbours = torch.stack([node[place + s] for s in steps], 1).contiguous()
     odd = _position(place, grid.size).sum(-1) % 2 == 1
     colours = [(free & c).nonzero().squeeze(-1) for c in (odd, ~odd)]
+    fast = backend == "warp" and grid.weights.dtype == torch.float32
+    sweep = sweep_warp if fast else sweep_torch
     for _ in range(_SWEEPS):
         for rows in colours:
-            sweep = (
-                sweep_warp
-                if backend == "warp" and grid.weights.dtype == torch.float32
-                else sweep_torch
-            )
             sweep(rows, neighbours, grid.weights)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from posing import ITERATIVE, METHODS, around, bent_tube, pose_of, share
 from torch import Tensor
 from tube import tube
 
@@ -15,34 +16,9 @@ from monopart.geometry.body_io import read_npy_object
 from monopart.geometry.errors import InputError
 from monopart.geometry.skinning import blend_transforms, skin
 from monopart.geometry.skinning_field import SkinningField, field_at, field_jacobian, vertex_maps
-from monopart.geometry.surface import SurfaceIndex, closest_on_triangle, vertex_normals
+from monopart.geometry.surface import SurfaceIndex, closest_on_triangle
 from monopart.geometry.unskin import Unskinned, inverse_skin
 from monopart.geometry.unskin_newton import Bones, Plan, newton_torch, newton_warp
-
-METHODS = ("nearest", "surface", "fixed_point", "broyden", "newton")
-ITERATIVE = METHODS[2:]
-
-
-def pose_of(body: BodyModel, pose: Tensor, betas: Tensor | None = None) -> PosedBody:
-    zero = BodyPose.zeros(body)
-    betas = zero.betas if betas is None else betas
-    return body(BodyPose(pose, betas, zero.rotation, zero.translation))
-
-
-def bent_tube(dtype: torch.dtype = torch.float64) -> tuple[BodyModel, PosedBody]:
-    body = tube(dtype)
-    pose = torch.tensor([[0.1, 0.2, -0.1], [0.2, 0.3, 0.7], [-0.3, 0.4, -0.5]], dtype=dtype)
-    return body, pose_of(body, pose)
-
-
-def around(verts: Tensor, faces: Tensor, count: int, reach: float = 0.03) -> Tensor:
-    """Points on a surface, displaced along its normals by up to ``reach``."""
-    face = torch.randint(0, len(faces), (count,))
-    bary = torch.rand(count, 3, dtype=verts.dtype)
-    bary = bary / bary.sum(-1, keepdim=True)
-    shift = (2 * torch.rand(count, 1, 1, dtype=verts.dtype) - 1) * reach
-    corners = verts[faces[face]] + shift * vertex_normals(verts, faces)[faces[face]]
-    return (bary[..., None] * corners).sum(1)
 
 
 def skinned(body: BodyModel, rest: Tensor, posed: PosedBody, points: Tensor) -> Tensor:
@@ -50,10 +26,6 @@ def skinned(body: BodyModel, rest: Tensor, posed: PosedBody, points: Tensor) -> 
     hit = SurfaceIndex(rest, body.faces).query(points)
     maps = vertex_maps(posed.transforms, body.weights)
     return field_at(points, hit.face, rest, body.faces, maps).image
-
-
-def share(mask: Tensor) -> float:
-    return mask.double().mean().item()
 
 
 @pytest.fixture(scope="module")
