@@ -1,22 +1,29 @@
 """The program ``monopart-bench``: run time against error, ours and other libraries'."""
 
 import argparse
+import dataclasses
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from monopart.geometry.errors import InputError
 from monopart.toolkit.cli import guarded
 
 from .registry import Settings
+
+if TYPE_CHECKING:
+    from .results import Report
 
 INSTALL = 'pip install "monopart[toolkit,bench]"'
 SUITES = {
     "geometry": "closest surface, inverse skinning, skinning, rotations, undistortion",
     "fields": "hash grid, compositing, networks",
-    "training": "PSNR against seconds of every preset on CAPTURE",
+    "training": "PSNR against seconds of every preset on each CAPTURE",
     "render": "seconds per picture of RUN",
-    "skipping": "samples that are left of a picture of RUN, and what a training step saves",
-    "scaling": "time against rays, samples, frames, parts, vertices, threads",
+    "skipping": "samples that are left of a picture, and what a training step saves",
+    "scaling": "time against rays, samples, frames, parts, joints, mesh size, points, threads",
 }
 
 
@@ -31,11 +38,11 @@ def parser() -> argparse.ArgumentParser:
     for name, text in SUITES.items():
         command = commands.add_parser(name, help=text, description=text)
         if name == "training":
-            command.add_argument("capture", type=Path, metavar="CAPTURE")
-            command.add_argument("--preset", action="append", default=[], metavar="NAME")
-            command.add_argument("--seconds", type=float, default=240.0, metavar="S")
-        elif name in ("render", "skipping"):
+            _training_arguments(command)
+        elif name == "render":
             command.add_argument("run", type=Path, metavar="RUN")
+        elif name == "skipping":
+            command.add_argument("run", type=Path, metavar="RUN_OR_CAPTURE")
         if name == "geometry":
             command.add_argument("--poses", type=int, default=20, metavar="N")
         if name in ("geometry", "render", "skipping"):
@@ -53,10 +60,20 @@ def parser() -> argparse.ArgumentParser:
     show.add_argument("--markdown", action="store_true")
     cuda = commands.add_parser("cuda-sources", help="compile all kernels for CUDA, without a GPU")
     cuda.add_argument("--arch", type=int, action="append", default=[], metavar="SM")
-    publish = commands.add_parser("publish", help="write reports into a page, in place")
-    publish.add_argument("reports", type=Path, nargs="+", metavar="REPORT.json")
+    text = "write reports into a page, in place; without reports those that it holds, anew"
+    publish = commands.add_parser("publish", help=text, description=text)
+    publish.add_argument("reports", type=Path, nargs="*", metavar="REPORT.json")
     publish.add_argument("--into", type=Path, default=Path("docs/benchmarks.md"), metavar="PAGE")
     return root
+
+
+def _training_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("captures", type=Path, nargs="+", metavar="CAPTURE")
+    command.add_argument("--preset", action="append", default=[], metavar="NAME")
+    command.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N")
+    budget = command.add_mutually_exclusive_group()
+    budget.add_argument("--seconds", type=float, default=240.0, metavar="S", help="of the clock")
+    budget.add_argument("--cpu-seconds", type=float, metavar="S", help="of the processor")
 
 
 def main(argv: Sequence[str] | None = None) -> int | None:
@@ -100,6 +117,10 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _settings(arguments: argparse.Namespace) -> Settings:
+    cpu = getattr(arguments, "cpu_seconds", None)
+    seconds = getattr(arguments, "seconds", 240.0) if cpu is None else cpu
+    if not 0 < seconds < math.inf:
+        raise InputError(f"--seconds, --cpu-seconds: expected more than 0, found {seconds:g}")
     return Settings(
         quick=arguments.quick,
         capture=getattr(arguments, "capture", None),
@@ -107,7 +128,9 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         only=tuple(arguments.only),
         poses=max(1, getattr(arguments, "poses", 20)),
         presets=tuple(getattr(arguments, "preset", ())),
-        seconds=getattr(arguments, "seconds", 240.0),
+        seconds=seconds,
+        cpu_budget=cpu is not None,
+        seeds=tuple(getattr(arguments, "seeds", (0,))),
     )
 
 
@@ -118,31 +141,35 @@ def _suite(arguments: argparse.Namespace) -> None:
 
     if arguments.threads is not None:
         torch.set_num_threads(max(1, arguments.threads))
-    settings, plots = _settings(arguments), {}
+    for report in _reports(arguments, _settings(arguments)):
+        path = save_report(report, arguments.out)
+        if arguments.markdown:
+            print(markdown(report), end="")
+        else:
+            print_report(report)
+        print(f"written: {path}", file=sys.stderr)
+
+
+def _reports(arguments: argparse.Namespace, settings: Settings) -> Iterator["Report"]:
+    """The report of a suite; of training, one per capture."""
+    from . import fields, geometry, render, scaling, skipping
+    from .show import save_report
+    from .suite import run_suite
+
+    def keep(report: "Report") -> None:
+        save_report(report, arguments.out)
+
     if arguments.command == "training":
         from .training import run_training
 
-        report, plots = run_training(settings)
-    else:
-        from . import fields, geometry, render, scaling, skipping
-        from .suite import run_suite
-
-        rooms = {"geometry": geometry, "fields": fields, "render": render}
-        rooms |= {"scaling": scaling, "skipping": skipping}
-        operations = rooms[arguments.command].operations()
-        report = run_suite(
-            arguments.command, operations, settings, lambda r: save_report(r, arguments.out)
-        )
-        if arguments.command == "scaling":
-            report = scaling.with_exponents(report)
-    path = save_report(report, arguments.out)
-    for name, plot in plots.items():
-        (arguments.out / name).write_text(plot, encoding="utf-8")
-    if arguments.markdown:
-        print(markdown(report), end="")
-    else:
-        print_report(report)
-    print(f"written: {path}", file=sys.stderr)
+        for capture in arguments.captures:
+            yield run_training(dataclasses.replace(settings, capture=capture), keep)
+        return
+    rooms = {"geometry": geometry, "fields": fields, "render": render}
+    rooms |= {"scaling": scaling, "skipping": skipping}
+    operations = rooms[arguments.command].operations()
+    report = run_suite(arguments.command, operations, settings, keep)
+    yield scaling.with_exponents(report) if arguments.command == "scaling" else report
 
 
 if __name__ == "__main__":

@@ -1,21 +1,22 @@
-"""Scatter plots with two logarithmic axes as SVG files, light or dark as the viewer is."""
+"""Scatter plots with logarithmic axes as SVG files, light or dark as the viewer is."""
 
 import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from monopart.toolkit.charts import log_ticks, tick_label
+from monopart.toolkit.charts import linear_ticks, log_ticks, tick_label
 
-_WIDTH, _HEIGHT = 760, 430
-_LEFT, _RIGHT, _TOP, _BOTTOM = 74, 230, 44, 52
+_WIDTH, _HEIGHT = 820, 430
+_LEFT, _RIGHT, _TOP, _BOTTOM = 74, 290, 44, 52
 _COLOURS = (
     *("#0b6e99", "#c2571a", "#3f7d20", "#8a3ffc", "#b8336a", "#6b6b6b", "#9a7d0a", "#1192e8"),
     *("#a2191f", "#005d5d", "#570408", "#198038"),
 )
 _STYLE = (
     "text{font:12px system-ui,sans-serif;fill:#222}.grid{stroke:#ddd}.title{font-size:15px;"
-    "font-weight:600}.front{stroke:#999;stroke-dasharray:4 4;fill:none}"
+    "font-weight:600}.front{stroke:#888;stroke-width:2;stroke-dasharray:5 4;fill:none}"
+    ".on{font-weight:600}"
     "@media(prefers-color-scheme:dark){text{fill:#eee}.grid{stroke:#444}.paper{fill:#161616}}"
 )
 
@@ -37,25 +38,32 @@ class Dots:
 
 
 @dataclass(frozen=True)
-class _Log:
-    """A logarithmic axis between two pixels."""
+class _Axis:
+    """A logarithmic or linear axis between two pixels."""
 
     ticks: tuple[float, ...]
     start: float
     end: float
+    log: bool = True
 
     def at(self, value: float) -> float:
-        low, high = math.log10(self.ticks[0]), math.log10(self.ticks[-1])
-        return self.start + (math.log10(value) - low) / (high - low) * (self.end - self.start)
+        low, high = self.ticks[0], self.ticks[-1]
+        if self.log:
+            low, high, value = math.log10(low), math.log10(high), math.log10(value)
+        return self.start + (value - low) / (high - low) * (self.end - self.start)
 
     def shown(self) -> list[float]:
         """Ticks that are labelled: powers of ten where there are many."""
+        if not self.log:
+            return list(self.ticks)
         powers = [t for t in self.ticks if abs(math.log10(t) - round(math.log10(t))) < 1e-9]
         return powers if len(self.ticks) > 7 and len(powers) > 1 else list(self.ticks)
 
 
-def _axis(values: list[float], start: int, end: int) -> _Log:
-    return _Log(tuple(log_ticks(min(values), max(values))), float(start), float(end))
+def _axis(values: list[float], start: int, end: int, log: bool = True) -> _Axis:
+    low, high = min(values), max(values)
+    ticks = log_ticks(low, high) if log else linear_ticks(low, high)
+    return _Axis(tuple(ticks), float(start), float(end), log)
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -71,8 +79,23 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, flo
     return front
 
 
+def _staircase(front: list[tuple[float, float]], x: _Axis, y: _Axis) -> str:
+    """The border of what some method reaches: level, then down at the next, more exact one."""
+    corners = [(x.at(front[0][0]), y.end)]
+    for a, b in front:
+        corners += [(x.at(a), corners[-1][1]), (x.at(a), y.at(b))]
+    corners.append((x.end, corners[-1][1]))
+    line = " ".join(f"{a:.1f},{b:.1f}" for a, b in corners)
+    return f'<polyline class="front" points="{line}"/>'
+
+
 def log_plot(
-    series: Sequence[Dots], title: str, x_label: str, y_label: str, front: bool = False
+    series: Sequence[Dots],
+    title: str,
+    x_label: str,
+    y_label: str,
+    front: bool = False,
+    log_y: bool = True,
 ) -> str:
     """An SVG file of points over two logarithmic axes.
 
@@ -81,7 +104,8 @@ def log_plot(
         title: heading.
         x_label: label below.
         y_label: label above the vertical axis.
-        front: draw the Pareto front of all points.
+        front: draw the Pareto front of all points, and the names on it in bold.
+        log_y: a logarithmic vertical axis; otherwise a linear one.
 
     >>> log_plot([Dots("a", [1.0], [2.0])], "t", "s", "m").startswith("<svg")
     True
@@ -94,12 +118,15 @@ def log_plot(
     body = f'<text x="{_LEFT}" y="40">nothing was measured</text>'
     if every:
         x = _axis([p[0] for p in every], _LEFT, _WIDTH - _RIGHT)
-        y = _axis([p[1] for p in every], _HEIGHT - _BOTTOM, _TOP)
-        body = _grid(x, y)
+        y = _axis([p[1] for p in every], _HEIGHT - _BOTTOM, _TOP, log_y)
+        body, best = _grid(x, y), set()
         if front:
-            line = " ".join(f"{x.at(a):.1f},{y.at(b):.1f}" for a, b in pareto_front(every))
-            body += f'<polyline class="front" points="{line}"/>'
-        body += "".join(_dots(i, dots, own, x, y) for i, (dots, own) in enumerate(points))
+            best = set(pareto_front(every))
+            body += _staircase(sorted(best), x, y) + _front_key(len(points))
+        body += "".join(
+            _dots(i, dots, own, (x, y), bool(best & set(own)))
+            for i, (dots, own) in enumerate(points)
+        )
     middle = (_LEFT + _WIDTH - _RIGHT) // 2
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img">'
@@ -112,7 +139,16 @@ def log_plot(
     )
 
 
-def _grid(x: _Log, y: _Log) -> str:
+def _front_key(number: int) -> str:
+    """The line of the legend that names the front."""
+    left, top = _WIDTH - _RIGHT + 12, _TOP + 10 + 20 * number
+    return (
+        f'<polyline class="front" points="{left},{top} {left + 20},{top}"/>'
+        f'<text x="{left + 24}" y="{top + 4}">Pareto front</text>'
+    )
+
+
+def _grid(x: _Axis, y: _Axis) -> str:
     out = []
     for tick in x.shown():
         left = x.at(tick)
@@ -130,7 +166,14 @@ def _grid(x: _Log, y: _Log) -> str:
     return "".join(out)
 
 
-def _dots(number: int, dots: Dots, own: list[tuple[float, float]], x: _Log, y: _Log) -> str:
+def _dots(
+    number: int,
+    dots: Dots,
+    own: list[tuple[float, float]],
+    axes: tuple[_Axis, _Axis],
+    best: bool,
+) -> str:
+    x, y = axes
     colour = _COLOURS[number % len(_COLOURS)]
     name = html.escape(dots.name)
     fill = colour if dots.bold else "none"
@@ -147,5 +190,6 @@ def _dots(number: int, dots: Dots, own: list[tuple[float, float]], x: _Log, y: _
         )
     left, top = _WIDTH - _RIGHT + 22, _TOP + 10 + 20 * number
     out.append(f'<circle cx="{left}" cy="{top}" r="{radius}" {style}/>')
-    out.append(f'<text x="{left + 14}" y="{top + 4}">{name}</text>')
+    kind = ' class="on"' if best else ""
+    out.append(f'<text{kind} x="{left + 14}" y="{top + 4}">{name}</text>')
     return f"<g>{''.join(out)}</g>"

@@ -1,18 +1,16 @@
 """``monopart-bench publish``: reports into a page of the documentation, in place."""
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 from monopart.geometry.errors import InputError
 
-from .results import Report, Table, read_report, summarise
-from .show import cells, growth, machine_line, pareto
-from .training import curve_plot
+from .results import Report, Row, Summary, Table, read_report, summarise, write_report
+from .show import cells, machine_line, main_size, seconds, table_plots
 
 BEGIN, END = "<!-- {}: begin -->", "<!-- {}: end -->"
-HEAD = ["size", "method", "median", "IQR", "CPU", "× ours", "error", "also"]
-_KEPT = (0, 1, 2, 4, 5, 6, 8, 9)  # columns of `show.cells` that the page has
+HEAD = ["method", "median", "IQR", "CPU", "× ours", "CPU × ours", "error", "also"]
+_KEPT = (1, 2, 4, 5, 6, 7, 8, 9)  # columns of `show.cells` that the page has
 
 
 def section(report: Report, name: str, folder: str) -> str:
@@ -25,63 +23,88 @@ def section(report: Report, name: str, folder: str) -> str:
     """
     out = [machine_line(report), ""]
     for table in report.tables:
-        out += [f"### {table.title}", "", f"Error: {table.error}.", ""]
-        out += ["| " + " | ".join(HEAD) + " |", "|" + "---|" * len(HEAD)]
-        for summary in summarise(table):
-            row = cells(summary)
-            out.append("| " + " | ".join(row[i] for i in _KEPT) + " |")
-        out.append("")
-        out += [f"- Absent: {a.method}: {a.reason}" for a in table.absent]
+        summaries = summarise(table)
+        out += [f"### {table.title}", ""]
+        if report.suite.startswith("training"):
+            out += _times(table) if table.operation == "time_to" else []
+        else:
+            out += _compared(table, summaries) + _grown(summaries)
+            out += [f"- Absent: {a.method}: {a.reason}" for a in table.absent]
         out += [f"- {note}" for note in table.notes]
-        out += [
-            "",
-            *(f"![{table.title}]({folder}/{file})" for file in plots(report, name, table)),
-            "",
-        ]
+        files = table_plots(report, name, table)
+        out += ["", *(f"![{table.title}]({folder}/{file})" for file in files), ""]
     return "\n".join(out).strip() + "\n"
 
 
-def plots(report: Report, name: str, table: Table) -> dict[str, str]:
-    """Plots of a table as SVG by file name: time against error, and against size.
+def _grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return [*lines, *("| " + " | ".join(row) + " |" for row in rows), ""]
 
-    Args:
-        report: the report.
-        name: of its file.
-        table: one of its tables.
-    """
-    found, summaries = {}, summarise(table)
-    stem = f"{name}_{table.operation}"
-    if report.suite.startswith("training"):
-        clocks = ("cpu", "wall") if table.operation == "curve" else ()
-        return {f"{stem}_{clock}.svg": curve_plot(table.rows, clock) for clock in clocks}
-    if len([s for s in summaries if s.error is not None]) > 1 and report.suite != "scaling":
-        found[f"{stem}_pareto.svg"] = pareto(table)
-    if len({s.size for s in summaries}) > 1:
-        found[f"{stem}_growth.svg"] = growth(table)
-    return found
+
+def _compared(table: Table, summaries: list[Summary]) -> list[str]:
+    """All figures, at the size on which most was measured; of growth, none."""
+    if table.error == "none":
+        return []
+    size = main_size(summaries)
+    rows = [cells(s) for s in summaries if s.size == size]
+    shown = [[row[i] for i in _KEPT] for row in rows]
+    return [f"Size {size}. Error: {table.error}.", "", *_grid(HEAD, shown)]
+
+
+def _grown(summaries: list[Summary]) -> list[str]:
+    """Median seconds of every method at every size, where there are several."""
+    sizes = sorted({s.size for s in summaries})
+    if len(sizes) < 2:
+        return []
+    at = {(s.method, s.size): seconds(s.wall) for s in summaries}
+    ours = {s.method: s.ours for s in summaries}
+    rows = [
+        [f"**{name}**" if bold else name, *(at.get((name, size), "") for size in sizes)]
+        for name, bold in ours.items()
+    ]
+    return _grid(["median by size", *(str(size) for size in sizes)], rows)
+
+
+def _times(table: Table) -> list[str]:
+    """CPU seconds, and seconds of the clock, to each PSNR: a row per preset."""
+    targets = sorted({row.size for row in table.rows})
+    at = {(row.method, row.size): _time(row) for row in table.rows}
+    names = dict.fromkeys(r.method for r in table.rows)
+    rows = [[name, *(at.get((name, target), "–") for target in targets)] for name in names]
+    text = "CPU seconds (seconds of the clock) to a PSNR in dB; – where it was not reached."
+    return [text, "", *_grid(["preset", *(f"{t / 10:g}" for t in targets)], rows)]
+
+
+def _time(row: Row) -> str:
+    shown = f"{row.cpu.median:.0f} ({row.wall.median:.0f})"
+    found, seeds = row.facts["seeds"], row.facts.get("of seeds", 1.0)
+    return shown if found == seeds else f"{shown}, {found:.0f} of {seeds:.0f} seeds"
 
 
 def publish(reports: Sequence[Path], page: Path) -> list[str]:
     """Write reports into a page, each between the marks of its suite.
 
-    The JSON of a report and its plots are put into a folder beside the page, named as the page.
+    A short form of each report and its plots are put into a folder beside the page, named as the
+    page.
 
     Args:
-        reports: JSON files of this program.
+        reports: JSON files of this program; none means those in that folder.
         page: a Markdown file that holds ``<!-- SUITE: begin -->`` and ``<!-- SUITE: end -->``.
 
     Returns:
         The suites that were written.
 
     Raises:
-        InputError: no such page, no marks for a suite, or a report of tiny problems.
+        InputError: no such page, no marks for a suite, a report of tiny problems, or no report.
     """
     try:
         text = page.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{page}: expected a Markdown page, found {error.strerror}") from None
-    read = [(path, read_report(path)) for path in reports]
     folder = page.with_suffix("")
+    read = [(path, read_report(path)) for path in reports or sorted(folder.glob("*.json"))]
+    if not read:
+        raise InputError(f"{folder}: expected reports, found none; name the files to publish")
     for path, report in read:
         if report.quick:
             raise InputError(f"{path}: expected measurements, found a --quick run; run it in full")
@@ -96,9 +119,9 @@ def publish(reports: Sequence[Path], page: Path) -> list[str]:
         text = f"{before}{begin}\n{section(report, name, folder.name)}{end}{after}"
     folder.mkdir(exist_ok=True)
     for path, report in read:
-        shutil.copyfile(path, folder / path.name)
+        write_report(report, folder / path.name, short=True)
         for table in report.tables:
-            for file, plot in plots(report, path.stem, table).items():
+            for file, plot in table_plots(report, path.stem, table).items():
                 (folder / file).write_text(plot, encoding="utf-8")
     page.write_text(text, encoding="utf-8")
     return [path.stem for path, _ in read]

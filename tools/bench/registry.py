@@ -27,7 +27,11 @@ class Settings:
     poses: int = 20
     """Poses on which geometry is measured."""
     seconds: float = 240.0
-    """Wall-clock budget of each training, seconds."""
+    """Budget of each training, seconds."""
+    cpu_budget: bool = False
+    """Whether the budget is of CPU seconds, not of those of the clock."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds with which each preset is trained."""
 
     @property
     def effort(self) -> Effort:

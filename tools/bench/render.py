@@ -38,22 +38,31 @@ def _picture(**options: Any) -> Callable[[Any], Callable[[], Any]]:
     return prepare
 
 
-def view_problems(settings: Settings) -> Iterator[Problem]:
-    """Some held-out views of a run.
+def trained(settings: Settings) -> Any:
+    """The avatar of the run that the command line named.
 
     Raises:
-        InputError: no run was named.
+        InputError: no run was named, or it cannot be read.
+    """
+    from monopart.toolkit.runs import open_run
+
+    if settings.run is None:
+        raise InputError("expected a run folder, found none; name one made by monopart train")
+    return open_run(settings.run, settings.capture)
+
+
+def view_problems(settings: Settings, opened: Callable[[Settings], Any]) -> Iterator[Problem]:
+    """Some held-out views of an avatar.
+
+    Args:
+        settings: what the command line asked for.
+        opened: finds the avatar.
     """
     import dataclasses
 
     from monopart.toolkit.avatar import view_of
-    from monopart.toolkit.runs import open_run
 
-    if settings.run is None:
-        raise InputError(
-            "render: expected a run folder, found none; name one made by monopart train"
-        )
-    avatar = open_run(settings.run, settings.capture)
+    avatar = opened(settings)
     record = avatar.record
     name = "novel_view" if "novel_view" in record.splits else "train"
     pairs = record.split(name).pairs()
@@ -98,7 +107,7 @@ def operations() -> tuple[Operation, ...]:
         Operation(
             *("picture", "Rendering one picture, posing the body included"),
             "largest difference in colour from the picture with every ray",
-            *(methods, view_problems, _judge),
+            *(methods, lambda settings: view_problems(settings, trained), _judge),
             ("Shares refer to 64 samples for every pixel of the image.",),
         ),
     )

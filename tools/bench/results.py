@@ -69,7 +69,7 @@ class Report:
     """One run of ``monopart-bench``."""
 
     suite: str
-    """geometry, fields, training, render or scaling."""
+    """geometry, fields, training, render, skipping or scaling."""
     quick: bool
     """Whether the problems were tiny."""
     environment: dict[str, Any]
@@ -104,12 +104,33 @@ class Summary:
     """The same of the CPU seconds."""
     facts: dict[str, float]
     """Other figures, mean over the settings."""
+    problems: int
+    """Number of settings it ran on."""
+    of: int
+    """Number of settings of that size."""
 
 
-def write_report(report: Report, path: Path) -> None:
-    """Write a report as JSON."""
-    data = {"schema": SCHEMA} | dataclasses.asdict(report)
-    path.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+def write_report(report: Report, path: Path, short: bool = False) -> None:
+    """Write a report as JSON.
+
+    Args:
+        report: the report.
+        path: the file.
+        short: numbers with five digits and no line breaks, a quarter of the bytes.
+    """
+    data: Any = {"schema": SCHEMA} | dataclasses.asdict(report)
+    indent, separators = (None, (",", ":")) if short else (1, None)
+    data = _shortened(data) if short else data
+    text = json.dumps(data, indent=indent, separators=separators, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def _shortened(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {key: _shortened(value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [_shortened(value) for value in data]
+    return float(f"{data:.5g}") if isinstance(data, float) else data
 
 
 def read_report(path: Path) -> Report:
@@ -158,8 +179,10 @@ def summarise(table: Table) -> list[Summary]:
     ours = next((r.method for r in table.rows if r.ours), None)
     base = {(r.size, r.setting): r for r in table.rows if r.method == ours}
     groups: dict[tuple[int, str], list[Row]] = {}
+    settings: dict[int, set[str]] = {}
     for row in table.rows:
         groups.setdefault((row.size, row.method), []).append(row)
+        settings.setdefault(row.size, set()).add(row.setting)
     result = []
     for (size, method), rows in groups.items():
         errors = [r.error for r in rows if r.error is not None]
@@ -181,6 +204,8 @@ def summarise(table: Table) -> list[Summary]:
                 _median(ratios) if ratios else None,
                 _median(cpu_ratios) if cpu_ratios else None,
                 {n: sum(v) / len(v) for n, v in means.items()},
+                len(rows),
+                len(settings[size]),
             )
         )
     return sorted(result, key=lambda s: (s.size, s.wall))

@@ -208,7 +208,7 @@ def operations() -> tuple[Operation, ...]:
 
 
 def exponents(table: Table) -> list[str]:
-    """Growth between the smallest and the largest size as a power, one sentence per method.
+    """Growth as a power of the size, one sentence per method: over all, and over the last step.
 
     Time ~ size^p; p = 1 is linear, 0 is flat.
     """
@@ -217,11 +217,17 @@ def exponents(table: Table) -> list[str]:
         lines.setdefault(summary.method, []).append((summary.size, summary.wall))
     result = []
     for method, points in lines.items():
-        (a, s), (b, t) = points[0], points[-1]
-        if b > a:
-            power = math.log(t / s) / math.log(b / a)
-            result.append(f"{method}: time ~ size^{power:.2f} from {a} to {b}")
+        if len(points) < 2:
+            continue
+        whole, last = _power(points[0], points[-1]), _power(points[-2], points[-1])
+        ends = f"from {points[0][0]} to {points[-1][0]}"
+        end = f", size^{last:.2f} in the last step" if len(points) > 2 else ""
+        result.append(f"{method}: time ~ size^{whole:.2f} {ends}{end}")
     return result
+
+
+def _power(a: tuple[int, float], b: tuple[int, float]) -> float:
+    return math.log(b[1] / a[1]) / math.log(b[0] / a[0])
 
 
 def with_exponents(report: Report) -> Report:

@@ -1,4 +1,4 @@
-"""How the cost of geometry grows: with points, faces, joints and threads."""
+"""How the cost of geometry grows: with points, faces, joints, bodies and threads."""
 
 import dataclasses
 import os
@@ -27,14 +27,18 @@ class Scaled:
 
     surface: SurfaceData
     threads: int = 0
+    bodies: int = BODIES
 
 
 def with_joints(body: BodyModel, count: int) -> BodyModel:
-    """The body with more joints: old ones, in turn, share their weights with a new child.
+    """The body with another number of joints.
+
+    Further joints share, in turn, the weights of an old one as its children; of fewer, the last
+    ones give their weights to their parents.
 
     Args:
         body: the body.
-        count: number of joints, at least that of the body.
+        count: number of joints, at least 1.
     """
     parents, weights = list(body.tree.parents), [body.weights[:, j] for j in range(body.num_joints)]
     regressor = list(body.joint_regressor)
@@ -43,11 +47,14 @@ def with_joints(body: BodyModel, count: int) -> BodyModel:
         weights.append(weights[joint])
         parents.append(joint)
         regressor.append(regressor[joint])
+    while len(parents) > count:  # parents come before their children: the last joint is a leaf
+        parent, last = parents.pop(), weights.pop()
+        weights[parent] = weights[parent] + last
     return dataclasses.replace(
         body,
         weights=torch.stack(weights, 1).contiguous(),
         tree=KinematicTree(tuple(parents)),
-        joint_regressor=torch.stack(regressor),
+        joint_regressor=torch.stack(regressor[:count]),
         posedirs=body.posedirs.new_zeros(body.num_verts, 3, 9 * (count - 1)),
         joint_names=(),
     )
@@ -57,7 +64,8 @@ def _posed(body: BodyModel, points: int = POINTS, threads: int = 0) -> Scaled:
     limits = joint_limits(BodyModel.default())
     _, pose = pose_list(BodyModel.default(), 3)[1]
     turned = torch.zeros(body.num_joints, 3)
-    turned[: len(limits)] = pose.pose
+    shared = min(len(limits), body.num_joints)
+    turned[:shared] = pose.pose[:shared]
     full = BodyPose(turned, pose.betas, pose.rotation, pose.translation)
     return Scaled(surface_data(body, full, points, shift=0.0), threads)
 
@@ -95,8 +103,8 @@ def _unskin(data: Scaled) -> Callable[[], Any]:
 def _skin(data: Scaled) -> Callable[[], Any]:
     body = data.surface.body
     generator = torch.Generator().manual_seed(4)
-    pose = 0.3 * torch.randn(BODIES, body.num_joints, 3, generator=generator)
-    betas, still = torch.zeros(BODIES, body.num_betas), torch.zeros(BODIES, 3)
+    pose = 0.3 * torch.randn(data.bodies, body.num_joints, 3, generator=generator)
+    betas, still = torch.zeros(data.bodies, body.num_betas), torch.zeros(data.bodies, 3)
 
     def call() -> Any:
         turned = pose.clone().requires_grad_()
@@ -126,9 +134,15 @@ def _faces(settings: Settings) -> Iterator[Problem]:
 
 
 def _joints(settings: Settings) -> Iterator[Problem]:
-    for count in (24, 26) if settings.quick else (24, 48, 96, 200):
+    for count in (12, 26) if settings.quick else (12, 24, 50, 100, 200):
         points = 32 if settings.quick else POINTS
         yield Problem(count, "joints", _posed(with_joints(BodyModel.default(), count), points))
+
+
+def _bodies(settings: Settings) -> Iterator[Problem]:
+    for count in (1, 2) if settings.quick else (1, 4, 16, 64, 256):
+        data = dataclasses.replace(_posed(BodyModel.default(), 16), bodies=count)
+        yield Problem(count, "bodies", data)
 
 
 def _threads(settings: Settings) -> Iterator[Problem]:
@@ -143,10 +157,12 @@ def geometry_axes() -> tuple[Operation, ...]:
     closest = Method("closest surface", _closest, ours=True)
     unskin = Method("inverse skinning (newton)", _unskin, ours=True)
     skin = Method(f"skinning of {BODIES} bodies, forward and backward", _skin, ours=True)
+    batch = Method("skinning, forward and backward", _skin, ours=True)
     axes = (
         ("points", _points, (closest, unskin)),
         ("faces", _faces, (closest, unskin, skin)),
-        ("joints", _joints, (skin, unskin)),
+        ("joints", _joints, (closest, unskin, skin)),
+        ("bodies", _bodies, (batch,)),
         ("cores", _threads, (closest, unskin, skin)),
     )
     return tuple(

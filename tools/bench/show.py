@@ -1,9 +1,10 @@
 """Tables for people: on the terminal, as Markdown, and as plots."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from .plots import Dots, log_plot
-from .results import Report, Summary, Table, summarise, write_report
+from .results import Report, Row, Summary, Table, summarise, write_report
 
 FLOOR = 1e-9
 """Errors below this are drawn here: a logarithmic axis has no zero."""
@@ -29,8 +30,11 @@ def _ratio(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
 
-def _facts(facts: dict[str, float]) -> str:
-    return ", ".join(f"{name} {value:.4g}" for name, value in facts.items())
+def _facts(summary: Summary) -> str:
+    shown = [f"{name} {value:.4g}" for name, value in summary.facts.items()]
+    if summary.problems < summary.of:  # ratios pair the same problems, medians and means do not
+        shown.append(f"on {summary.problems} of {summary.of} problems")
+    return ", ".join(shown)
 
 
 def cells(summary: Summary) -> list[str]:
@@ -45,7 +49,7 @@ def cells(summary: Summary) -> list[str]:
         _ratio(summary.ratio),
         _ratio(summary.cpu_ratio),
         _number(summary.error),
-        _facts(summary.facts),
+        _facts(summary),
     ]
 
 
@@ -100,15 +104,26 @@ def markdown(report: Report) -> str:
     return "\n".join(out).rstrip() + "\n"
 
 
-def pareto(table: Table) -> str:
-    """Run time against error, one dot per method, at the size with most methods."""
-    summaries = [s for s in summarise(table) if s.error is not None]
-    counts: dict[int, int] = {}
+def _named(summary: Summary) -> str:
+    few = f" ({summary.problems} of {summary.of})" if summary.problems < summary.of else ""
+    return summary.method + few
+
+
+def main_size(summaries: Sequence[Summary]) -> int:
+    """The size that most problems have, and of several the one with most methods; 0 for none."""
+    counts: dict[int, tuple[int, int]] = {}
     for summary in summaries:
-        counts[summary.size] = counts.get(summary.size, 0) + 1
-    size = max(counts, key=lambda s: (counts[s], s), default=0)
+        problems, methods = counts.get(summary.size, (0, 0))
+        counts[summary.size] = (max(problems, summary.of), methods + 1)
+    return max(counts, key=lambda size: (*counts[size], size), default=0)
+
+
+def pareto(table: Table) -> str:
+    """Run time against error, one dot per method, at the size on which most was measured."""
+    summaries = [s for s in summarise(table) if s.error is not None]
+    size = main_size(summaries)
     series = [
-        Dots(s.method, [s.wall], [max(s.error or 0.0, FLOOR)], bold=s.ours)
+        Dots(_named(s), [s.wall], [max(s.error or 0.0, FLOOR)], bold=s.ours)
         for s in summaries
         if s.size == size
     ]
@@ -127,6 +142,42 @@ def growth(table: Table) -> str:
     return log_plot(series, table.title, "size", "median seconds")
 
 
+def curve_plot(rows: list[Row], clock: str) -> str:
+    """PSNR of held-out views against seconds, one line per preset.
+
+    Args:
+        rows: of the table "curve".
+        clock: "cpu" or "wall".
+    """
+    series = []
+    for name in dict.fromkeys(r.method for r in rows):
+        own = [r for r in rows if r.method == name and r.wall.median > 0]
+        times = [(r.cpu if clock == "cpu" else r.wall).median for r in own]
+        series.append(Dots(name, times, [r.facts["PSNR"] for r in own], True, True))
+    label = "CPU seconds" if clock == "cpu" else "wall-clock seconds"
+    return log_plot(series, "Training", label, "PSNR of held-out views, dB", log_y=False)
+
+
+def table_plots(report: Report, name: str, table: Table) -> dict[str, str]:
+    """Plots of a table as SVG by file name: time against error, and against size.
+
+    Args:
+        report: the report.
+        name: of its file.
+        table: one of its tables.
+    """
+    found, summaries = {}, summarise(table)
+    stem = f"{name}_{table.operation}"
+    if report.suite.startswith("training"):
+        clocks = ("cpu", "wall") if table.operation == "curve" else ()
+        return {f"{stem}_{clock}.svg": curve_plot(table.rows, clock) for clock in clocks}
+    if len([s for s in summaries if s.error is not None]) > 1:
+        found[f"{stem}_pareto.svg"] = pareto(table)
+    if len({s.size for s in summaries}) > 1:
+        found[f"{stem}_growth.svg"] = growth(table)
+    return found
+
+
 def save_report(report: Report, out: Path) -> Path:
     """Write the JSON, the Markdown and the plots of a report into a folder.
 
@@ -138,8 +189,6 @@ def save_report(report: Report, out: Path) -> Path:
     write_report(report, path)
     (out / f"{report.suite}.md").write_text(markdown(report), encoding="utf-8")
     for table in report.tables:
-        name = f"{report.suite}_{table.operation}"
-        (out / f"{name}_pareto.svg").write_text(pareto(table), encoding="utf-8")
-        if len({row.size for row in table.rows}) > 1:
-            (out / f"{name}_growth.svg").write_text(growth(table), encoding="utf-8")
+        for name, plot in table_plots(report, report.suite, table).items():
+            (out / name).write_text(plot, encoding="utf-8")
     return path

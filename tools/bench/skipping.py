@@ -1,6 +1,7 @@
 """``monopart-bench skipping RUN``: what is left of the work, and what leaving it out saves."""
 
 import copy
+import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,11 +12,12 @@ import torch
 from monopart.geometry.errors import InputError
 
 from .registry import Method, Operation, Problem, Settings
-from .render import ViewData, view_problems
+from .render import PRUNE, ViewData, trained, view_problems
 from .timing import Effort
 
 RAYS = 1024
 BEYOND = 10.0  # metres: a radius within which every part of a person lies
+ONCE = Effort(1, 1, 0.0)
 SLOW = Effort(rounds=5, least=3, seconds=30.0)
 
 
@@ -70,13 +72,30 @@ def _step(
     return prepare
 
 
-def _trainer(settings: Settings) -> Any:
-    from monopart.toolkit.runs import open_run
-    from monopart.toolkit.train import Trainer
+def opened(settings: Settings) -> Any:
+    """The avatar of a run, or an untrained one of a capture.
+
+    Raises:
+        InputError: neither was named, or it cannot be read.
+    """
+    from monopart.toolkit.avatar import Avatar
+    from monopart.toolkit.cache import user_cache
+    from monopart.toolkit.captures import read_capture
+    from monopart.toolkit.presets import preset
 
     if settings.run is None:
-        raise InputError("skipping: expected a run folder, found none; name one of monopart train")
-    return Trainer(open_run(settings.run, settings.capture))
+        raise InputError("skipping: expected a run or a capture, found none; name a folder")
+    if (settings.run / "config.json").is_file():
+        return trained(settings)
+    record, config = read_capture(settings.run), preset("fast")
+    torch.manual_seed(config.seed)
+    return Avatar.create(record, config, user_cache())
+
+
+def _trainer(settings: Settings) -> Any:
+    from monopart.toolkit.train import Trainer
+
+    return Trainer(opened(settings))
 
 
 def _near(settings: Settings) -> Iterator[Problem]:
@@ -111,32 +130,39 @@ def _judge_step(data: BatchData, out: Any) -> dict[str, float]:
     }
 
 
-def _shares(data: ViewData) -> Callable[[], Any]:
+def _views(settings: Settings) -> Iterator[Problem]:
+    for problem in view_problems(settings, opened):
+        yield dataclasses.replace(problem, effort=ONCE)
+
+
+def _shares(prune: float) -> Callable[[ViewData], Callable[[], Any]]:
     """Samples of a picture before and after each kind of skipping, in percent of the dense ones."""
 
-    def call() -> dict[str, float]:
-        from monopart.toolkit.render import render_view
-        from monopart.toolkit.scene import shell_pixels
+    def prepare(data: ViewData) -> Callable[[], Any]:
+        return lambda: _counted(data, prune)
 
-        avatar, view = data.avatar, data.view
-        scene = avatar.pose_scene(view.pose)
-        _, rays, *_ = shell_pixels(view.camera, scene, 0)
-        shell = scene.parts.shell
-        samples = shell.sample(rays, avatar.config.geometry.step)
-        pairs = scene.parts.pairs(samples)
-        picture = render_view(avatar, view, scene=scene)
-        height, width = view.camera.size
-        per_ray = 64.0 * height * width / 100.0
-        exact = float((picture.color - data.dense.color).abs().max())
-        return {
-            "error": exact,
-            "in the box %": samples.dense / per_ray,
-            "in shell voxels %": len(samples.depth) / per_ray,
-            "within a part's radius %": len(pairs.sample.unique()) / per_ray,
-            "reach a network %": picture.stats["colors_evaluated"] / per_ray,
-        }
+    return prepare
 
-    return call
+
+def _counted(data: ViewData, prune: float) -> dict[str, float]:
+    from monopart.toolkit.render import render_view
+    from monopart.toolkit.scene import shell_pixels
+
+    avatar, view = data.avatar, data.view
+    scene = avatar.pose_scene(view.pose)
+    _, rays, *_ = shell_pixels(view.camera, scene, 0)
+    samples = scene.parts.shell.sample(rays, avatar.config.geometry.step)
+    pairs = scene.parts.pairs(samples)
+    picture = render_view(avatar, view, scene=scene, prune=prune)
+    height, width = view.camera.size
+    per_ray = 64.0 * height * width / 100.0
+    return {
+        "error": float((picture.color - data.dense.color).abs().max()),
+        "in the box %": samples.dense / per_ray,
+        "in shell voxels %": len(samples.depth) / per_ray,
+        "within a part's radius %": len(pairs.sample.unique()) / per_ray,
+        "reach a network %": picture.stats["colors_evaluated"] / per_ray,
+    }
 
 
 def operations() -> tuple[Operation, ...]:
@@ -145,10 +171,17 @@ def operations() -> tuple[Operation, ...]:
         Operation(
             *("shares", "Samples of a picture that are left"),
             "largest difference in colour from the picture with nothing skipped",
-            (Method("count and render", _shares, ours=True),),
-            view_problems,
+            (
+                Method("exact skipping", _shares(0.0), ours=True),
+                Method(f"learned occupancy, {PRUNE}", _shares(PRUNE), ours=True),
+            ),
+            _views,
             lambda data, figures: figures,
-            ("Percent of 64 samples for every pixel of the image; the time is of counting.",),
+            (
+                "Percent of 64 samples for every pixel of the image; the time is of counting.",
+                "In the box: of the rays that meet the shell. Without a part in its radius nothing "
+                "is evaluated; samples behind an opaque front reach no network.",
+            ),
         ),
         *(
             Operation(

@@ -136,5 +136,4 @@ def judge_unskin(data: SurfaceData, result: Any) -> dict[str, float]:
         "error": float(np.quantile(gap, 0.95)),
         "share": float((gap <= 1e-3).mean() * 100),
         "valid": float(result.valid.double().mean() * 100),
-        "reported ≤ 1 mm": float((result.residual <= 1e-3).double().mean() * 100),
     }
