@@ -123,7 +123,7 @@ def test_training_and_render_suites(tmp_path: Path, demo_capture: Path) -> None:
     assert [r["size"] for r in curve["rows"]] == [2]  # steps
     for row in curve["rows"]:
         assert row["error"] == pytest.approx(10 ** (-row["facts"]["PSNR"] / 20))
-    assert (out / "training_cpu.svg").is_file()
+    assert (out / f"training_{demo_capture.name}_curve_cpu.svg").is_file()
 
     record = read_capture(demo_capture)
     config = with_overrides(preset("tiny"), field={"log2_size": 8, "prior_slope": 0.0})
