@@ -14,7 +14,7 @@ from .body import BodyModel, PosedBody
 from .errors import InputError
 from .skinning_field import SkinningField
 from .unskin import Query, attach, plan_of, prepare, solve, surface_guess, weights_of
-from .unskin_newton import ARRIVED, Bones, Plan, Roots, newton_torch
+from .unskin_newton import ARRIVED, Plan, Roots, newton_torch
 
 
 @dataclass(frozen=True)
@@ -104,27 +104,16 @@ def _every_start(query: Query, maps: Tensor, plan: Plan) -> list[tuple[Roots, Te
     """The root of each start, alone, and its weights."""
     bones, targets = query.bones(), query.points.detach()
     alone = replace(plan, starts=1)
-    count = min(plan.starts, bones.joints.shape[0] + 1)
-    return [
-        _one_start(query, maps, bones, alone, _guess(query, bones, targets, n))
-        for n in range(count)
-    ]
-
-
-def _guess(query: Query, bones: Bones, targets: Tensor, number: int) -> Tensor | None:
-    """First rest points of one start; None lets the Warp solver look them up."""
-    if number > 0:
-        return bones.guess(targets, number - 1)
-    return None if query.fast else surface_guess(query)
-
-
-def _one_start(
-    query: Query, maps: Tensor, bones: Bones, plan: Plan, guess: Tensor | None
-) -> tuple[Roots, Tensor]:
-    if query.fast or guess is None:
-        return solve(query, maps, bones, plan, None if guess is None else guess.contiguous())
-    roots = newton_torch(query.field, query.points.detach(), maps, bones, plan, guess)
-    return roots, weights_of(query, roots)
+    found = []
+    for number in range(min(plan.starts, bones.joints.shape[0] + 1)):
+        # the closest face itself: the voxel look-up of `inverse_skin` finds fewer roots in contacts
+        guess = surface_guess(query) if number == 0 else bones.guess(targets, number - 1)
+        if query.fast:
+            found.append(solve(query, maps, bones, alone, guess.contiguous()))
+        else:
+            roots = newton_torch(query.field, targets, maps, bones, alone, guess)
+            found.append((roots, weights_of(query, roots)))
+    return found
 
 
 def _distinct(
