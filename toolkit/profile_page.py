@@ -179,6 +179,8 @@ _STYLE = """
 border-radius:5px;padding:6px 12px;cursor:pointer}
 #kinds button[aria-pressed=true]{background:var(--ink);color:var(--bg)}
 .dbar{padding:10px 0}
+th.n{white-space:normal;max-width:12ch}
+table{font-size:14px}th,td{padding:4px 10px 4px 0}td:first-child{white-space:nowrap}
 """
 
 _SCRIPT = """
