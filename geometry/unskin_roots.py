@@ -16,6 +16,8 @@ from .skinning_field import SkinningField
 from .unskin import Query, attach, plan_of, prepare, solve, surface_guess, weights_of
 from .unskin_newton import ARRIVED, Plan, Roots, newton_torch
 
+_ITERATIONS = 12  # a start that may be far away gets more steps than one of `inverse_skin`
+
 
 @dataclass(frozen=True)
 class UnskinnedRoots:
@@ -85,7 +87,7 @@ def inverse_skin_all(
             f"apart, most: expected metres > 0 and a number of roots ≥ 1, found {apart}, {most}; "
             "use 0.01 and 3"
         )
-    plan = plan_of("newton", max_distance, starts, None, points.dtype)
+    plan = plan_of("newton", max_distance, starts, _ITERATIONS, points.dtype)
     query = prepare(points, posed, body, rest_verts)
     maps = query.field.maps(query.posed.transforms)
     with torch.no_grad():
