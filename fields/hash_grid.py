@@ -324,7 +324,7 @@ def _add_table_gradient(
     # disjoint levels per job: no atomics, and the same sums for any number of threads
     jobs = 1 if cuda else min(levels, torch.get_num_threads())
     launch_jobs(
-        table_kernel(features, cuda),
+        table_kernel(features),
         [[*args, job, jobs, _table_rows(grad)] for job in range(jobs)],
         len(points),
         points,

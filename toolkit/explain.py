@@ -55,8 +55,8 @@ def skip_rows(stats: Mapping[str, int], what: str, num_parts: int) -> list[SkipR
             SkipRow(
                 f"{what}: of the same samples, those that reach a network",
                 PER_RAY * stats["pixels"],
-                stats.get("colors_evaluated"),
-                "all of the rows below together",
+                stats.get("samples_reached"),
+                "the kinds above and those below together",
             ),
         ]
     evaluated = stats.get("samples_evaluated", shell)

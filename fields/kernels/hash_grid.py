@@ -1,25 +1,129 @@
 """Warp kernels of the multiresolution hash grid.
 
-One thread per point, levels looped inside. Tables, outputs and cotangents are read as vectors
-of ``features`` floats. A mask of 0 marks a level that is stored densely. The time goes into waiting
-for memory, so a thread asks for the rows of a level two levels before it needs them.
+One thread per point, levels inside. Tables, outputs and cotangents are read as rows of ``features``
+floats. A mask of 0 marks a level that is stored densely. The rows of all levels of a point are
+computed before the first one is read: that loop becomes vector instructions, and the loads of all
+levels wait for memory at the same time.
 """
 # a kernel lists its arrays and is one body; int() and float() make Warp variables
-# ruff: noqa: PLR0915
 
 import functools
 from typing import Any, no_type_check
 
 import warp as wp
 
-PRIME_Y = wp.constant(wp.uint32(2654435761))
-PRIME_Z = wp.constant(wp.uint32(805459861))
-
-_PREFETCH = """
-#if !defined(__CUDA_ARCH__)
-    __builtin_prefetch(table.data + j);
+# Rows of all levels of a point first, then the look-ups: the loop over levels becomes vector
+# instructions on the CPU, and every load is known before the first one is waited for.
+_ROWS = """
+#if defined(__CUDA_ARCH__)
+    const int W = 1;  // a GPU keeps one level in registers
+#else
+    const int W = 16;
 #endif
+    const int levels = offsets.shape[1];
+    const int* offset_of = offsets.data + k * levels;
+    const int* mask_of = masks.data + k * levels;
+    const int* cells_of = resolutions.data + k * levels;
+    int row[8][W];
+    float u[W], v[W], w[W];
+    int at[W], mask[W], cells[W];
+    for (int begin = first; begin < levels; begin += W * step) {
+        int n = 0;
+        for (int l = begin; l < levels && n < W; l += step, n++) {
+            at[n] = offset_of[l]; mask[n] = mask_of[l]; cells[n] = cells_of[l];
+        }
+        for (int j = 0; j < n; j++) {
+            const int last = cells[j] - 1;
+            const float px = p[0] * (float)cells[j];
+            const float py = p[1] * (float)cells[j];
+            const float pz = p[2] * (float)cells[j];
+            int x = (int)px, y = (int)py, z = (int)pz;
+            // the last vertex belongs to the last cell; the clamp also keeps NaN inside the table
+            x = x > last ? last : x; x = x < 0 ? 0 : x;
+            y = y > last ? last : y; y = y < 0 ? 0 : y;
+            z = z > last ? last : z; z = z < 0 ? 0 : z;
+            u[j] = px - (float)x; v[j] = py - (float)y; w[j] = pz - (float)z;
+            const unsigned m = (unsigned)mask[j];
+            const unsigned x0 = (unsigned)x, x1 = x0 + 1u;
+            const unsigned y0 = (unsigned)y * 2654435761u, y1 = y0 + 2654435761u;
+            const unsigned z0 = (unsigned)z * 805459861u, z1 = z0 + 805459861u;
+            const int side = cells[j] + 1;
+            const int d = x + side * (y + side * z);
+            const int dz = side * side;
+            const bool dense = mask[j] == 0;
+            row[0][j] = at[j] + (dense ? d : (int)((x0 ^ y0 ^ z0) & m));
+            row[1][j] = at[j] + (dense ? d + 1 : (int)((x1 ^ y0 ^ z0) & m));
+            row[2][j] = at[j] + (dense ? d + side : (int)((x0 ^ y1 ^ z0) & m));
+            row[3][j] = at[j] + (dense ? d + side + 1 : (int)((x1 ^ y1 ^ z0) & m));
+            row[4][j] = at[j] + (dense ? d + dz : (int)((x0 ^ y0 ^ z1) & m));
+            row[5][j] = at[j] + (dense ? d + dz + 1 : (int)((x1 ^ y0 ^ z1) & m));
+            row[6][j] = at[j] + (dense ? d + dz + side : (int)((x0 ^ y1 ^ z1) & m));
+            row[7][j] = at[j] + (dense ? d + dz + side + 1 : (int)((x1 ^ y1 ^ z1) & m));
+        }
+        for (int j = 0; j < n; j++) {
+            const long long place = ((long long)i * levels + begin + j * step) * FEATURES;
+            const float s = 1.0f - u[j], t = 1.0f - v[j], r = 1.0f - w[j];
+            LEVEL
+        }
+    }
 """
+_LOOK_UP = """
+            const float* from = (const float*)table.data;
+            float* to = (float*)out.data + place;
+            const float* c0 = from + (long long)row[0][j] * FEATURES;
+            const float* c1 = from + (long long)row[1][j] * FEATURES;
+            const float* c2 = from + (long long)row[2][j] * FEATURES;
+            const float* c3 = from + (long long)row[3][j] * FEATURES;
+            const float* c4 = from + (long long)row[4][j] * FEATURES;
+            const float* c5 = from + (long long)row[5][j] * FEATURES;
+            const float* c6 = from + (long long)row[6][j] * FEATURES;
+            const float* c7 = from + (long long)row[7][j] * FEATURES;
+            for (int f = 0; f < FEATURES; f++) {
+                const float e00 = s * c0[f] + u[j] * c1[f], e01 = s * c2[f] + u[j] * c3[f];
+                const float e10 = s * c4[f] + u[j] * c5[f], e11 = s * c6[f] + u[j] * c7[f];
+                to[f] = r * (t * e00 + v[j] * e01) + w[j] * (t * e10 + v[j] * e11);
+            }
+"""
+_SCATTER = """
+            const float* g = (const float*)cotangent.data + place;
+            float* to = (float*)grad.data;
+            const float share[8] = {
+                s * t * r, u[j] * t * r, s * v[j] * r, u[j] * v[j] * r,
+                s * t * w[j], u[j] * t * w[j], s * v[j] * w[j], u[j] * v[j] * w[j]};
+            for (int c = 0; c < 8; c++) {
+                float* q = to + (long long)row[c][j] * FEATURES;
+                for (int f = 0; f < FEATURES; f++) {
+#if defined(__CUDA_ARCH__)
+                    atomicAdd(q + f, share[c] * g[f]);
+#else
+                    q[f] += share[c] * g[f];
+#endif
+                }
+            }
+"""
+_SLOPE = """
+            const float* g = (const float*)cotangent.data + place;
+            const float* from = (const float*)table.data;
+            float a[8];
+            for (int c = 0; c < 8; c++) {
+                const float* q = from + (long long)row[c][j] * FEATURES;
+                float dot = 0.0f;
+                for (int f = 0; f < FEATURES; f++) dot += q[f] * g[f];
+                a[c] = dot;
+            }
+            const float scale = (float)cells[j];
+            const float e00 = s * a[0] + u[j] * a[1], e01 = s * a[2] + u[j] * a[3];
+            const float e10 = s * a[4] + u[j] * a[5], e11 = s * a[6] + u[j] * a[7];
+            gx += scale * (r * (t * (a[1] - a[0]) + v[j] * (a[3] - a[2]))
+                + w[j] * (t * (a[5] - a[4]) + v[j] * (a[7] - a[6])));
+            gy += scale * (r * (e01 - e00) + w[j] * (e11 - e10));
+            gz += scale * (t * (e10 - e00) + v[j] * (e11 - e01));
+"""
+_SLOPES = (
+    "float gx = 0.0f, gy = 0.0f, gz = 0.0f;"
+    + _ROWS.replace("LEVEL", _SLOPE)
+    + "return wp::vec_t<3, float>(gx, gy, gz);"
+)
 _ROW = {1: wp.float32, 2: wp.vec2, 4: wp.vec4}
 
 
@@ -39,117 +143,30 @@ def _part_of(part: wp.array(dtype=wp.int32), i: int, parts: int) -> int:
     return k
 
 
-@no_type_check
-@wp.struct
-class Corners:
-    """The table rows of a cell (named by z, y; x is a or b) and the position in the cell."""
-
-    a00: int
-    b00: int
-    a01: int
-    b01: int
-    a10: int
-    b10: int
-    a11: int
-    b11: int
-    u: float
-    v: float
-    w: float
+def _native(text: str, features: int) -> str:
+    return text.replace("FEATURES", str(features))
 
 
 @no_type_check
-@wp.func
-def _corners(p: wp.vec3, res: int, mask: int, offset: int) -> Corners:
-    px = p[0] * float(res)
-    py = p[1] * float(res)
-    pz = p[2] * float(res)
-    # the last vertex belongs to the last cell; the clamp also keeps NaN inside the table
-    x = wp.clamp(int(px), 0, res - 1)
-    y = wp.clamp(int(py), 0, res - 1)
-    z = wp.clamp(int(pz), 0, res - 1)
-    c = Corners()
-    c.u = px - float(x)
-    c.v = py - float(y)
-    c.w = pz - float(z)
-    if mask == 0:
-        n = res + 1
-        n2 = n * n
-        c.a00 = offset + x + y * n + z * n2
-        c.a01 = c.a00 + n
-        c.a10 = c.a00 + n2
-        c.a11 = c.a10 + n
-        c.b00 = c.a00 + 1
-        c.b01 = c.a01 + 1
-        c.b10 = c.a10 + 1
-        c.b11 = c.a11 + 1
-    else:
-        m = wp.uint32(mask)
-        x0 = wp.uint32(x)
-        x1 = wp.uint32(x + 1)
-        y0 = wp.uint32(y) * PRIME_Y
-        y1 = y0 + PRIME_Y
-        z0 = wp.uint32(z) * PRIME_Z
-        z1 = z0 + PRIME_Z
-        h00 = y0 ^ z0
-        h01 = y1 ^ z0
-        h10 = y0 ^ z1
-        h11 = y1 ^ z1
-        c.a00 = offset + int((x0 ^ h00) & m)
-        c.b00 = offset + int((x1 ^ h00) & m)
-        c.a01 = offset + int((x0 ^ h01) & m)
-        c.b01 = offset + int((x1 ^ h01) & m)
-        c.a10 = offset + int((x0 ^ h10) & m)
-        c.b10 = offset + int((x1 ^ h10) & m)
-        c.a11 = offset + int((x0 ^ h11) & m)
-        c.b11 = offset + int((x1 ^ h11) & m)
-    return c
-
-
-@no_type_check
-@wp.func
-def _level(
-    p: wp.vec3,
-    k: int,
-    l: int,
-    offsets: wp.array2d(dtype=wp.int32),
-    masks: wp.array2d(dtype=wp.int32),
-    resolutions: wp.array2d(dtype=wp.int32),
-) -> Corners:
-    """Return the corners of point p in level l, or in the last level beyond it."""
-    m = wp.min(l, offsets.shape[1] - 1)
-    return _corners(p, resolutions[k, m], masks[k, m], offsets[k, m])
-
-
-@no_type_check  # here, not on fetch, where it would hide the return type from Warp
-@functools.cache
-def _row_functions(features: int) -> tuple[Any, Any]:
-    """Build ``fetch(table, row)`` and ``ask_ahead(table, corners)`` for contiguous tables."""
-    row = _ROW[features]
-
-    @wp.func_native("return table.data[j];")  # the generic access multiplies by a stride
-    def fetch(table: wp.array(dtype=row), j: int) -> row: ...  # pyright: ignore
-
-    @no_type_check
-    @wp.func_native(_PREFETCH)
-    def prefetch(table: wp.array(dtype=row), j: int): ...
-
-    @no_type_check
-    @wp.func
-    def ask_ahead(table: wp.array(dtype=row), c: Corners):
-        # x neighbours mostly share a cache line
-        prefetch(table, c.a00)
-        prefetch(table, c.a01)
-        prefetch(table, c.a10)
-        prefetch(table, c.a11)
-
-    return fetch, ask_ahead
-
-
 @functools.cache
 def forward_kernel(features: int) -> Any:
     """Build the look-up for tables of ``features`` columns (1, 2 or 4)."""
     row = _ROW[features]
-    fetch, ask_ahead = _row_functions(features)
+
+    @no_type_check
+    @wp.func_native(_native(_ROWS.replace("LEVEL", _LOOK_UP), features))
+    def look_up(
+        p: wp.vec3,
+        k: int,
+        i: int,
+        first: int,
+        step: int,
+        table: wp.array(dtype=row),
+        offsets: wp.array2d(dtype=wp.int32),
+        masks: wp.array2d(dtype=wp.int32),
+        resolutions: wp.array2d(dtype=wp.int32),
+        out: wp.array2d(dtype=row),
+    ): ...
 
     @no_type_check
     @wp.kernel(enable_backward=False, module="unique")
@@ -166,47 +183,35 @@ def forward_kernel(features: int) -> Any:
         i = start + wp.tid()
         p = _clamp01(points[i])
         k = _part_of(part, i, offsets.shape[0])
-        c = _level(p, k, 0, offsets, masks, resolutions)
-        c1 = _level(p, k, 1, offsets, masks, resolutions)
-        for l in range(offsets.shape[1]):
-            c2 = _level(p, k, l + 2, offsets, masks, resolutions)
-            ask_ahead(table, c2)
-            u = c.u
-            s = 1.0 - u
-            out[i, l] = (1.0 - c.w) * (
-                (1.0 - c.v) * (s * fetch(table, c.a00) + u * fetch(table, c.b00))
-                + c.v * (s * fetch(table, c.a01) + u * fetch(table, c.b01))
-            ) + c.w * (
-                (1.0 - c.v) * (s * fetch(table, c.a10) + u * fetch(table, c.b10))
-                + c.v * (s * fetch(table, c.a11) + u * fetch(table, c.b11))
-            )
-            c = c1
-            c1 = c2
+        look_up(p, k, i, 0, 1, table, offsets, masks, resolutions, out)
 
     return hash_grid_forward
 
 
+@no_type_check
 @functools.cache
-def table_kernel(features: int, atomic: bool) -> Any:
+def table_kernel(features: int) -> Any:
     """Build the scatter of a cotangent into the table, for the levels first, first + step, ... .
 
-    Without ``atomic`` (CPU) launches side by side must have disjoint levels: the sum is then taken
-    in the order of the points, whatever the number of threads.
+    On the CPU launches side by side must have disjoint levels: the sum is then taken in the order
+    of the points, whatever the number of threads. On CUDA the sums are atomic.
     """
     row = _ROW[features]
-    _, ask_ahead = _row_functions(features)
 
     @no_type_check
-    @wp.func_native("table.data[j] += value;")
-    def add_plain(table: wp.array(dtype=row), j: int, value: row): ...
-
-    @no_type_check
-    @wp.func
-    def add(table: wp.array(dtype=row), j: int, value: row):
-        if wp.static(atomic):
-            wp.atomic_add(table, j, value)
-        else:
-            add_plain(table, j, value)
+    @wp.func_native(_native(_ROWS.replace("LEVEL", _SCATTER), features))
+    def scatter(
+        p: wp.vec3,
+        k: int,
+        i: int,
+        first: int,
+        step: int,
+        grad: wp.array(dtype=row),
+        offsets: wp.array2d(dtype=wp.int32),
+        masks: wp.array2d(dtype=wp.int32),
+        resolutions: wp.array2d(dtype=wp.int32),
+        cotangent: wp.array2d(dtype=row),
+    ): ...
 
     @no_type_check
     @wp.kernel(enable_backward=False, module="unique")
@@ -225,45 +230,30 @@ def table_kernel(features: int, atomic: bool) -> Any:
         i = start + wp.tid()
         p = _clamp01(points[i])
         k = _part_of(part, i, offsets.shape[0])
-        c = _level(p, k, first, offsets, masks, resolutions)
-        c1 = _level(p, k, first + step, offsets, masks, resolutions)
-        for l in range(first, offsets.shape[1], step):
-            c2 = _level(p, k, l + 2 * step, offsets, masks, resolutions)
-            ask_ahead(grad, c2)
-            g = cotangent[i, l]
-            g0 = (1.0 - c.w) * g
-            g1 = c.w * g
-            g00 = (1.0 - c.v) * g0
-            g01 = c.v * g0
-            g10 = (1.0 - c.v) * g1
-            g11 = c.v * g1
-            add(grad, c.a00, (1.0 - c.u) * g00)
-            add(grad, c.b00, c.u * g00)
-            add(grad, c.a01, (1.0 - c.u) * g01)
-            add(grad, c.b01, c.u * g01)
-            add(grad, c.a10, (1.0 - c.u) * g10)
-            add(grad, c.b10, c.u * g10)
-            add(grad, c.a11, (1.0 - c.u) * g11)
-            add(grad, c.b11, c.u * g11)
-            c = c1
-            c1 = c2
+        scatter(p, k, i, first, step, grad, offsets, masks, resolutions, cotangent)
 
     return hash_grid_table_gradient
 
 
+@no_type_check
 @functools.cache
 def points_kernel(features: int) -> Any:
     """Build the gradient of the look-up in the points."""
     row = _ROW[features]
-    fetch, ask_ahead = _row_functions(features)
 
-    @no_type_check
-    @wp.func
-    def dot(a: row, b: row) -> float:
-        if wp.static(features == 1):
-            return a * b
-        else:
-            return wp.dot(a, b)
+    @wp.func_native(_native(_SLOPES, features))
+    def slopes(
+        p: wp.vec3,
+        k: int,
+        i: int,
+        first: int,
+        step: int,
+        table: wp.array(dtype=row),
+        offsets: wp.array2d(dtype=wp.int32),
+        masks: wp.array2d(dtype=wp.int32),
+        resolutions: wp.array2d(dtype=wp.int32),
+        cotangent: wp.array2d(dtype=row),
+    ) -> wp.vec3: ...
 
     @no_type_check
     @wp.kernel(enable_backward=False, module="unique")
@@ -282,48 +272,11 @@ def points_kernel(features: int) -> Any:
         raw = points[i]
         p = _clamp01(raw)
         k = _part_of(part, i, offsets.shape[0])
-        gx = float(0.0)
-        gy = float(0.0)
-        gz = float(0.0)
-        c = _level(p, k, 0, offsets, masks, resolutions)
-        c1 = _level(p, k, 1, offsets, masks, resolutions)
-        for l in range(offsets.shape[1]):
-            c2 = _level(p, k, l + 2, offsets, masks, resolutions)
-            ask_ahead(table, c2)
-            g = cotangent[i, l]
-            a00 = dot(fetch(table, c.a00), g)
-            b00 = dot(fetch(table, c.b00), g)
-            a01 = dot(fetch(table, c.a01), g)
-            b01 = dot(fetch(table, c.b01), g)
-            a10 = dot(fetch(table, c.a10), g)
-            b10 = dot(fetch(table, c.b10), g)
-            a11 = dot(fetch(table, c.a11), g)
-            b11 = dot(fetch(table, c.b11), g)
-            u = c.u
-            v = c.v
-            w = c.w
-            s = 1.0 - u
-            t = 1.0 - v
-            r = 1.0 - w
-            e00 = s * a00 + u * b00
-            e01 = s * a01 + u * b01
-            e10 = s * a10 + u * b10
-            e11 = s * a11 + u * b11
-            scale = float(resolutions[k, l])
-            gx += scale * (
-                r * (t * (b00 - a00) + v * (b01 - a01)) + w * (t * (b10 - a10) + v * (b11 - a11))
-            )
-            gy += scale * (r * (e01 - e00) + w * (e11 - e10))
-            gz += scale * (t * (e10 - e00) + v * (e11 - e01))
-            c = c1
-            c1 = c2
+        g = slopes(p, k, i, 0, 1, table, offsets, masks, resolutions, cotangent)
         # outside [0, 1] the look-up is constant
-        if raw[0] < 0.0 or raw[0] > 1.0:
-            gx = 0.0
-        if raw[1] < 0.0 or raw[1] > 1.0:
-            gy = 0.0
-        if raw[2] < 0.0 or raw[2] > 1.0:
-            gz = 0.0
-        grad[i] = wp.vec3(gx, gy, gz)
+        for axis in range(3):
+            if raw[axis] < 0.0 or raw[axis] > 1.0:
+                g[axis] = 0.0
+        grad[i] = g
 
     return hash_grid_points_gradient

@@ -19,6 +19,7 @@ from torch import Tensor
 from monopart.geometry.stages import stage
 
 _SMALL = 1024  # below this many items a second thread costs more than it saves
+_CHUNKS = 4  # of a thread, at most
 _LOCK = threading.Lock()
 _READY: list[bool] = []
 _COMPILED: set[Any] = set()  # kernels whose module is loaded for the CPU
@@ -93,7 +94,9 @@ def launch(kernel: Any, count: int, args: list[Any], like: Tensor, smallest: int
     if like.device.type == "cuda" or threads == 1 or count < smallest:
         launch_one(kernel, count, args, like)
         return
-    cuts = [count * i // threads for i in range(threads + 1)]
+    # several chunks a thread: one that is held up leaves the rest to the others
+    chunks = threads * max(1, min(_CHUNKS, count // (threads * _SMALL)))
+    cuts = [count * i // chunks for i in range(chunks + 1)]
     _run_side_by_side(kernel, [(b - a, [a, *args]) for a, b in itertools.pairwise(cuts)])
 
 

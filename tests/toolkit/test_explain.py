@@ -20,6 +20,7 @@ COUNTS = {
     "samples_evaluated": 80,
     "pairs_found": 120,
     "pairs_evaluated": 90,
+    "samples_reached": 70,
     "colors_evaluated": 70,
 }
 

@@ -20,7 +20,7 @@ PACKAGES = ("monopart.geometry.kernels", "monopart.fields.kernels")
 FACTORIES: dict[str, tuple[tuple[Any, ...], ...]] = {
     "forward_kernel": ((1,), (2,), (4,)),
     "points_kernel": ((1,), (2,), (4,)),
-    "table_kernel": ((1, True), (2, True), (4, True)),
+    "table_kernel": ((1,), (2,), (4,)),
     "row_adam_kernel": ((1,), (2,), (4,)),
 }
 """Functions that make kernels, with the arguments that are used on CUDA."""

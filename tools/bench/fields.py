@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from monopart.fields.hash_grid import GridSpec, HashGrid
+from monopart.fields.hash_grid import PRIMES, GridSpec, HashGrid
 from monopart.fields.mlp import PartMLP
 from monopart.fields.volume import composite, composite_dense
 
@@ -51,7 +51,29 @@ class _Grid:
     grid: HashGrid
 
     def __call__(self, backend: Any, points: Tensor) -> Tensor:
+        if backend == "levels":
+            return self._levels(points)
         return self.grid(points, None, backend=backend)
+
+    def _levels(self, points: Tensor) -> Tensor:
+        """What a first version does: one level after the other, each an embedding."""
+        spec = self.grid.specs[0]
+        bits = torch.tensor([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)])
+        tables, out = self.grid.table.split(list(spec.sizes)), []
+        for cells, size, dense, table in zip(
+            spec.resolutions, spec.sizes, spec.dense, tables, strict=True
+        ):
+            place = points * cells
+            cell = place.detach().long().clamp(max=cells - 1)
+            x, y, z = (cell[:, None] + bits).unbind(-1)
+            if dense:
+                row = x + (cells + 1) * (y + (cells + 1) * z)
+            else:
+                row = ((x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])) & (size - 1)
+            inside = (place - cell)[:, None]
+            share = torch.where(bits == 1, inside, 1 - inside).prod(-1, keepdim=True)
+            out.append((torch.nn.functional.embedding(row, table) * share).sum(1))
+        return torch.cat(out, -1)
 
     def double_outcome(self, case: Case) -> Outcome:
         """The same table in double precision."""
@@ -178,6 +200,12 @@ def kernel_methods(compiled: str = "torch") -> tuple[Method, ...]:
     return (Method("monopart (Warp)", _run("warp"), ours=True), plain, fast)
 
 
+def grid_methods() -> tuple[Method, ...]:
+    """Back ends of the hash grid, and eager torch as one writes it first."""
+    plain = Method("torch, eager, level by level", _run("levels"), largest=POINTS)
+    return (*kernel_methods(), plain)
+
+
 def network_methods() -> tuple[Method, ...]:
     """Ways to run one small network per part."""
     return (
@@ -244,11 +272,11 @@ def operations() -> tuple[Operation, ...]:
     kinds = (
         (
             *("grid", "Hash grid, 16 levels × 2, 2^16 rows a level"),
-            *(functools.partial(_grids, rows=16), kernel_methods()),
+            *(functools.partial(_grids, rows=16), grid_methods()),
         ),
         (
             *("grid_large", "Hash grid, 16 levels × 2, 2^19 rows a level"),
-            *(functools.partial(_grids, rows=19), kernel_methods()),
+            *(functools.partial(_grids, rows=19), grid_methods()),
         ),
         ("composite", "Compositing", _volumes, kernel_methods("dense")),
         ("mlp", "One network 32-64-64-16 per part", _networks, network_methods()),

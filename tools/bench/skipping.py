@@ -126,7 +126,7 @@ def _judge_step(data: BatchData, out: Any) -> dict[str, float]:
         "error": float((out.color.detach() - data.dense).abs().max()),
         "samples": float(out.stats["samples_shell"]),
         "pairs": float(out.stats["pairs_evaluated"]),
-        "reach a network": float(out.stats["colors_evaluated"]),
+        "reach a network": float(out.stats["samples_reached"]),
     }
 
 
@@ -161,7 +161,7 @@ def _counted(data: ViewData, prune: float) -> dict[str, float]:
         "in the box %": samples.dense / per_ray,
         "in shell voxels %": len(samples.depth) / per_ray,
         "within a part's radius %": len(pairs.sample.unique()) / per_ray,
-        "reach a network %": picture.stats["colors_evaluated"] / per_ray,
+        "reach a network %": picture.stats["samples_reached"] / per_ray,
     }
 
 
