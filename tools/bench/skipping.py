@@ -15,7 +15,7 @@ from .registry import Method, Operation, Problem, Settings
 from .render import PRUNE, ViewData, trained, view_problems
 from .timing import Effort
 
-RAYS = 1024
+RAYS = 2048  # as in training
 BEYOND = 10.0  # metres: a radius within which every part of a person lies
 ONCE = Effort(1, 1, 0.0)
 SLOW = Effort(rounds=5, least=3, seconds=30.0)
