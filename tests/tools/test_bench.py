@@ -18,12 +18,13 @@ from monopart.tools.bench import compare, results, suite
 from monopart.tools.bench.bodies import near_points, pose_list, surface_data
 from monopart.tools.bench.cli import main
 from monopart.tools.bench.meshes import subdivided
-from monopart.tools.bench.plots import pareto_front
+from monopart.tools.bench.plots import Dots, log_plot, pareto_front
 from monopart.tools.bench.registry import Method, Operation, Problem, Settings
+from monopart.tools.bench.scaling import exponents
+from monopart.tools.bench.show import cells, markdown
 from monopart.tools.bench.skinning_methods import plain_arrays, plain_skinning
 from monopart.tools.bench.surface_methods import judge_surface
 from monopart.tools.bench.timing import Effort, measure, spread
-from monopart.tools.bench.training import Mark, held_out, reached
 
 SPREAD = {"median", "min", "q1", "q3", "count"}
 ROW = {"method", "ours", "size", "setting", "wall", "cpu", "error", "facts"}
@@ -51,11 +52,10 @@ def _check_schema(path: Path, suite_name: str) -> dict:
     return data
 
 
-def _run(name: str, out: Path, *arguments: str, written: str = "") -> dict:
+def _run(name: str, out: Path, *arguments: str) -> dict:
     assert main([name, *arguments, "--quick", "--out", str(out)]) is None
-    written = written or name
-    data = _check_schema(out / f"{written}.json", written)
-    assert (out / f"{written}.md").read_text()
+    data = _check_schema(out / f"{name}.json", name)
+    assert (out / f"{name}.md").read_text()
     for plot in out.glob("*.svg"):
         ElementTree.parse(plot)
     return data
@@ -110,7 +110,7 @@ def test_scaling_suite(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_training_and_render_suites(tmp_path: Path, demo_capture: Path) -> None:
+def test_render_and_skipping_suites(tmp_path: Path, demo_capture: Path) -> None:
     from monopart.toolkit.avatar import Avatar
     from monopart.toolkit.captures import read_capture
     from monopart.toolkit.checkpoint import save_weights
@@ -118,13 +118,6 @@ def test_training_and_render_suites(tmp_path: Path, demo_capture: Path) -> None:
     from monopart.toolkit.runs import create_run
 
     out = tmp_path / "bench"
-    data = _run("training", out, str(demo_capture), written=f"training_{demo_capture.name}")
-    curve = data["tables"][0]
-    assert [r["size"] for r in curve["rows"]] == [2]  # steps
-    for row in curve["rows"]:
-        assert row["error"] == pytest.approx(10 ** (-row["facts"]["PSNR"] / 20))
-    assert (out / f"training_{demo_capture.name}_curve_cpu.svg").is_file()
-
     record = read_capture(demo_capture)
     config = with_overrides(preset("tiny"), field={"log2_size": 8, "prior_slope": 0.0})
     run = create_run(tmp_path / "run", config, record)
@@ -133,6 +126,9 @@ def test_training_and_render_suites(tmp_path: Path, demo_capture: Path) -> None:
     rows = {r["method"]: r for r in data["tables"][0]["rows"]}
     assert rows["exact skipping"]["error"] < 1e-4
     assert 0 < rows["exact skipping"]["facts"]["rays %"] <= 100
+    untrained = _run("skipping", out, str(demo_capture), "--only", "shares")["tables"][0]["rows"]
+    assert {r["method"] for r in untrained} == {"exact skipping", "learned occupancy, 0.002"}
+    assert all(r["error"] < 1e-4 for r in untrained)
     data = _run("skipping", out, str(run))
     (left,) = data["tables"][0]["rows"][:1]
     facts = left["facts"]
@@ -160,6 +156,7 @@ def test_absent_peers_name_their_install_line() -> None:
     assert "wrong version" in reasons["broken"]
     assert "pip install broken" in reasons["broken"]
     assert [r.method for r in table.rows] == ["ours", "ours"]
+    assert table.rows[0].wall.count == 1
     assert table.rows[1].facts == {"twice": 8.0}
 
 
@@ -178,6 +175,37 @@ def test_our_own_errors_are_not_hidden() -> None:
     )
     with pytest.raises(ValueError, match="a bug of ours"):
         suite.run_operation(operation, Settings(quick=True))
+
+
+def test_slow_methods_run_once_and_rare_ones_seldom() -> None:
+    calls: list[str] = []
+
+    def method(name: str, single: bool = False, rare: bool = False) -> Method:
+        ours = name == "ours"
+        return Method(
+            name, lambda data: lambda: calls.append(name), ours=ours, single=single, rare=rare
+        )
+
+    methods = (
+        method("ours"),
+        method("single", single=True),
+        method("rare", rare=True),
+    )
+    effort = Effort(rounds=2, least=2)
+    problems = [Problem(1, name, 0.0, effort, name == "a") for name in ("a", "b", "c")]
+    operation = Operation(
+        *("id", "Identity", "none", methods), lambda settings: problems, lambda data, result: {}
+    )
+    table = suite.run_operation(operation, Settings())
+    assert calls.count("single") == 3
+    assert calls.count("rare") == 3  # one problem, a first run and two rounds
+    counts = {r.method: r.wall.count for r in table.rows}
+    assert counts == {"ours": 2, "single": 1, "rare": 2}
+    few = {s.method: (s.problems, s.of) for s in results.summarise(table)}
+    assert few == {"ours": (3, 3), "single": (3, 3), "rare": (1, 3)}
+    assert "| **ours** |" in markdown(results.Report("x", False, suite.environment(), [table]))
+    said = {s.method: cells(s)[-1] for s in results.summarise(table)}
+    assert said == {"ours": "", "single": "", "rare": "on 1 of 3 problems"}
 
 
 def test_measure_takes_turns() -> None:
@@ -284,22 +312,27 @@ def test_subdivided_body_keeps_its_surface() -> None:
     assert fine.uv.corner_uv.shape[0] == len(fine.faces)
 
 
-def test_time_to_psnr_is_interpolated() -> None:
-    marks = [Mark(0, 0.0, 0.0, 10.0), Mark(5, 2.0, 4.0, 20.0), Mark(9, 4.0, 8.0, 30.0)]
-    assert reached(marks, 25.0) == (3.0, 6.0)
-    assert reached(marks, 31.0) is None
-    assert reached(marks, 5.0) == (0.0, 0.0)
-
-
-def test_held_out_views_take_turns(captures_dir: Path) -> None:
-    from monopart.toolkit.captures import read_capture
-
-    pairs = held_out(read_capture(captures_dir / "actor_a"))
-    assert pairs[:5] == [(1, 0), (2, 10), (3, 20), (4, 30), (1, 40)]
-    assert len(pairs) == 10
-
-
 def test_pareto_front_drops_beaten_points() -> None:
     points = [(1.0, 3.0), (2.0, 2.0), (2.5, 2.0), (3.0, 1.0), (4.0, 5.0)]
     assert pareto_front(points) == [(1.0, 3.0), (2.0, 2.0), (3.0, 1.0)]
     assert not math.isnan(sum(y for _, y in pareto_front(points)))
+
+
+def test_plots_mark_the_front() -> None:
+    series = [Dots("fast", [1.0], [1.0]), Dots("exact", [9.0], [0.1]), Dots("beaten", [9.0], [2.0])]
+    drawn = ElementTree.fromstring(log_plot(series, "t", "s", "m", front=True))
+    texts = {e.text: e.get("class") for e in drawn.iter() if e.tag.endswith("text")}
+    assert (texts["fast"], texts["exact"], texts["beaten"]) == ("on", "on", None)
+    assert "Pareto front" in texts
+    border = next(e for e in drawn.iter() if e.tag.endswith("polyline")).get("points") or ""
+    assert len(border.split()) == 6  # level and down, twice, and an end on either side
+
+
+def test_exponents_over_all_and_at_the_end() -> None:
+    rows = [
+        results.Row("m", True, n, "", spread([t]), spread([t]), None, {})
+        for n, t in ((1, 1.0), (2, 1.0), (4, 2.0))
+    ]
+    (line,) = exponents(results.Table("o", "O", "none", rows, [], []))
+    assert line == "m: time ~ size^0.50 from 1 to 4, size^1.00 in the last step"
+    assert not exponents(results.Table("o", "O", "none", rows[:1], [], []))

@@ -162,6 +162,12 @@ def _reports(arguments: argparse.Namespace, settings: Settings) -> Iterator["Rep
     if arguments.command == "training":
         from .training import run_training
 
+        names = [capture.absolute().name for capture in arguments.captures]
+        if len(set(names)) < len(names):
+            raise InputError(
+                f"CAPTURE: expected folders of different names, found {', '.join(names)}; the "
+                "reports are named after them"
+            )
         for capture in arguments.captures:
             yield run_training(dataclasses.replace(settings, capture=capture), keep)
         return

@@ -28,6 +28,10 @@ POINTS = 32_768
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 MANY = Effort(rounds=5, least=2, seconds=0.5)
 """For each of many poses."""
+THREE = Effort(rounds=7, least=2, seconds=2.0)
+"""For each of three poses."""
+LARGE = Effort(rounds=3, least=2, seconds=2.0)
+"""For a million points."""
 
 
 def _thorough(number: int, count: int) -> bool:
@@ -45,7 +49,8 @@ def _near_surface(settings: Settings) -> Iterator[Problem]:
         yield Problem(count, name, surface_data(body, pose, count, seed), MANY, slow)
     for size in (16,) if settings.quick else SIZES:
         name, pose = poses[len(poses) // 2]
-        yield Problem(size, name, surface_data(body, pose, size))
+        effort = LARGE if size == max(SIZES) else None
+        yield Problem(size, name, surface_data(body, pose, size), effort)
 
 
 def _one_size(settings: Settings) -> Iterator[Problem]:
@@ -54,7 +59,7 @@ def _one_size(settings: Settings) -> Iterator[Problem]:
     poses = pose_list(body, 3, settings.capture)
     count = 32 if settings.quick else POINTS
     for seed, (name, pose) in enumerate(poses[:1] if settings.quick else poses):
-        yield Problem(count, name, surface_data(body, pose, count, seed))
+        yield Problem(count, name, surface_data(body, pose, count, seed), THREE)
 
 
 def _poses_only(settings: Settings) -> Iterator[Problem]:

@@ -77,6 +77,8 @@ class Method:
     """Another reason for absence, or None."""
     rare: bool = False
     """Takes seconds a run: only on problems that ask for it, three of twenty."""
+    single: bool = False
+    """Takes many seconds a run: its one run is the timed one."""
     slow_start: bool = False
     """Takes seconds to prepare: left out of quick runs."""
 

@@ -9,7 +9,7 @@ from monopart.geometry.errors import InputError, MonopartError
 
 from .registry import Method, Operation, Problem, Settings
 from .results import Absence, Report, Row, Table, finite
-from .timing import measure
+from .timing import Timing, measure, spread, timed
 
 PEERS = (
     *("open3d", "libigl", "trimesh", "fcpw", "scipy", "pykdtree", "rtree", "smplx"),
@@ -103,6 +103,7 @@ def _rows(
 ) -> list[Row]:
     """All methods on one problem; what breaks is reported as absent and not tried again."""
     calls: dict[str, Callable[[], Any]] = {}
+    once: dict[str, tuple[float, float, Any]] = {}
     used: dict[str, Method] = {}
     for method in methods:
         too_large = (method.largest or problem.size) < problem.size
@@ -110,7 +111,7 @@ def _rows(
             continue
         try:
             call = method.prepare(problem.data)
-            call()
+            first = timed(call)
         except (ImportError, AttributeError, RuntimeError, TypeError, ValueError) as error:
             if method.ours and not isinstance(error, ImportError | MonopartError):
                 raise
@@ -118,9 +119,15 @@ def _rows(
             absent[method.name] = f"did not run ({type(error).__name__}: {line}); {method.install}"
             say(f"  {method.name}: {absent[method.name]}")
             continue
-        calls[method.name], used[method.name] = call, method
+        used[method.name] = method
+        if method.single:
+            once[method.name] = first
+        else:
+            calls[method.name] = call
     effort = problem.effort if problem.effort and not settings.quick else settings.effort
     timings, results = measure(calls, effort, warm=True)
+    for name, (wall, cpu, result) in once.items():
+        timings[name], results[name] = Timing(spread([wall]), spread([cpu])), result
     rows = []
     for name, timing in timings.items():
         read = used[name].read

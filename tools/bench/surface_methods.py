@@ -233,7 +233,9 @@ def surface_methods(moving: bool = False) -> tuple[Method, ...]:
     """Methods of the closest surface point, for still or for moving vertices."""
     wrap = _moving if moving else _query
     small = 40_000
-    slow = Method("monopart torch (reference)", wrap(OursPlain), ours=True, largest=1024)
+    slow = Method(
+        *("monopart torch (reference)", wrap(OursPlain)), ours=True, largest=1024, single=True
+    )
     return (
         Method("monopart", wrap(Ours), ours=True),
         *(() if moving else (slow,)),

@@ -279,7 +279,7 @@ def run_training(settings: Settings, keep: Callable[[Report], Any] = lambda repo
     error = "root mean square of the colour error"
     curve = Table("curve", "PSNR against seconds (size: steps)", error, [], [], notes)
     times = Table("time_to", "Seconds to a PSNR (size: dB × 10)", error, [], [], [])
-    suite = f"training_{record.name}"
+    suite = f"training_{settings.capture.absolute().name}"
     report = Report(suite, settings.quick, environment(), [curve, times])
     for name in settings.presets or (("tiny",) if settings.quick else preset_names()):
         runs, note = _one_preset(name, record, settings)

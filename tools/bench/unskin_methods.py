@@ -113,7 +113,7 @@ def unskin_methods() -> tuple[Method, ...]:
         ),
         Method("fixed point", _method("fixed_point"), ours=True, needs=one),
         Method("closest surface", _method("surface"), ours=True, needs=one),
-        Method("nearest vertex", _method("nearest"), needs=one),
+        Method("nearest vertex", _method("nearest"), needs=one, rare=True),
     )
 
 
