@@ -7,6 +7,8 @@ levels wait for memory at the same time.
 """
 # a kernel lists its arrays and is one body; int() and float() make Warp variables
 
+# pyright: reportInvalidTypeForm=false
+
 import functools
 from typing import Any, no_type_check
 
