@@ -125,7 +125,7 @@ _DISPLAYS = ("dash", "plotly", "plotly.graph_objects")
 class _Nothing(types.ModuleType):
     """In the place of a module of which nothing is used."""
 
-    __path__: tuple[str, ...] = ()
+    __path__ = []  # noqa: RUF012 - a module may be looked into: a package without modules
 
     def __getattr__(self, name: str) -> type:
         if name.startswith("__"):
