@@ -4,6 +4,7 @@ The geometry itself knows nothing of files: it takes finished tensors as argumen
 """
 
 from importlib import metadata
+from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int, Integer
@@ -12,7 +13,6 @@ from torch import Tensor
 from monopart.fields import distance_prior as prior_code
 from monopart.fields.distance_prior import DistancePrior
 from monopart.geometry import culling as shell_code
-from monopart.geometry import surface as surface_code
 from monopart.geometry.body import BodyModel, PosedBody
 from monopart.geometry.culling import BodyShell
 from monopart.geometry.parts import PartMap
@@ -37,7 +37,6 @@ def distance_prior(
     Returns:
         The prior.
     """
-    from monopart.geometry.kernels import closest
 
     def unpack(tensors: Tensors) -> DistancePrior:
         values = tensors["values"].to(verts.device)
@@ -45,7 +44,7 @@ def distance_prior(
 
     return cache.fetch(
         "prior",
-        (verts, faces, REACH, CELL, *_code(verts), prior_code, surface_code, closest),
+        (verts, faces, REACH, CELL, *_code(verts), prior_code),
         lambda: DistancePrior(verts, faces, REACH, CELL),
         lambda prior: {"values": prior.values[0, 0].cpu()},
         unpack,
@@ -103,8 +102,15 @@ def narrowed(bits: Integer[Tensor, "n"], width: int) -> Integer[Tensor, "n"]:
     return bits.to(torch.int16) if width < 16 else bits
 
 
-def _code(like: Tensor) -> tuple:
-    """What computes voxels: code and library, and the kind of machine."""
-    from monopart.geometry.kernels import shell
+def geometry_sources() -> list[Path]:
+    """Source files of the geometry: all of them, for a list by hand misses what is added later.
 
-    return shell_code, shell, metadata.version("warp-lang"), like.device.type
+    Returns:
+        The files, in the order of their names.
+    """
+    return sorted(Path(shell_code.__file__).parent.rglob("*.py"))
+
+
+def _code(like: Tensor) -> tuple:
+    """What computes geometry: code and library, and the kind of machine."""
+    return geometry_sources(), metadata.version("warp-lang"), like.device.type

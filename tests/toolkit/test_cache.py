@@ -16,6 +16,7 @@ from safetensors.torch import load_file, save_file
 from monopart.geometry.culling import BodyShell
 from monopart.geometry.errors import InputError
 from monopart.toolkit import cache as cache_module
+from monopart.toolkit import prepared
 from monopart.toolkit.avatar import Avatar
 from monopart.toolkit.cache import NO_CACHE, Cache, content_key, user_cache
 from monopart.toolkit.captures import check_capture, read_capture
@@ -321,6 +322,23 @@ def test_unfinished_files_of_dead_processes_are_removed(tmp_path: Path, told: To
     os.utime(dead, (0.0, 0.0))
     numbers(cache, 7)
     assert alive.exists() and not dead.exists()
+
+
+def test_geometry_is_made_anew_when_any_of_its_code_changes(
+    tmp_path: Path, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = {path.relative_to(path.parents[1]).as_posix() for path in prepared.geometry_sources()}
+    assert {"geometry/surface.py", "geometry/face_tree.py", "kernels/face_tree.py"} <= names
+    assert {"geometry/culling.py", "kernels/shell.py", "geometry/norms.py"} <= names
+    verts = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+    faces = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    cache, changed = told.cache(tmp_path / "cache"), tmp_path / "face_tree.py"
+    sources = prepared.geometry_sources()
+    monkeypatch.setattr(prepared, "geometry_sources", lambda: [*sources, changed])
+    for text, entries in (("old", 1), ("old", 1), ("new", 2)):
+        changed.write_text(text)
+        prepared.distance_prior(verts, faces, cache)
+        assert cache.facts()["entries"] == entries, text
 
 
 def test_a_file_that_changes_while_it_is_read_is_not_kept(tmp_path: Path, told: Told) -> None:
