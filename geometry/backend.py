@@ -22,7 +22,7 @@ def warp_is_installed() -> bool:
     return importlib.util.find_spec("warp") is not None
 
 
-def choose_backend(backend: Backend, like: Tensor) -> Literal["warp", "torch"]:
+def choose_backend(backend: str, like: Tensor) -> Literal["warp", "torch"]:
     """Resolve a back end by name; what is asked for by name runs or raises.
 
     Args:

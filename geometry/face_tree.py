@@ -27,6 +27,7 @@ class FaceTrees:
         slots: [S] int32 face of each place in a leaf, -1 where there is none.
         boxes: [R, 8] float32, six rows a node: lower x y z and upper x y z of its children.
         tris: [T, 8] float32, nine rows a leaf: first corner and two edges of its faces.
+        corners: [F, 3] int32 vertex indices of the faces, for kernels.
 
     >>> verts = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     >>> tree = FaceTrees(verts[None], torch.tensor([[0, 1, 2]]))
@@ -63,7 +64,7 @@ class FaceTrees:
         rows = [np.flatnonzero(owner == k) for k in range(num_groups)]
         trees = [_split(centres, r) for r in rows]
         self.leaves = [len(t) for t in trees]
-        self._corners = faces.int().contiguous()
+        self.corners = faces.int().contiguous()
         self._lay_out(trees)
         self.refit(verts)
 
@@ -102,7 +103,7 @@ class FaceTrees:
         for group, leaves in enumerate(self.leaves):
             if leaves == 0:
                 continue
-            args = [view(verts, 3), view(self._corners), view(self.slots), *shared, group, leaves]
+            args = [view(verts, 3), view(self.corners), view(self.slots), *shared, group, leaves]
             args += [view(self.boxes), view(self.tris)]
             launch(refit_leaves, leaves * self.bodies, args, verts)
             nodes = leaves
@@ -116,7 +117,7 @@ class FaceTrees:
     def places(self) -> Int[Tensor, "f"]:
         """Place of each face in `slots`, int32, for one group."""
         rows = torch.nonzero(self.slots >= 0).squeeze(-1)
-        places = torch.zeros(len(self._corners), dtype=torch.int32, device=self.device)
+        places = torch.zeros(len(self.corners), dtype=torch.int32, device=self.device)
         places[self.slots[rows].long()] = rows.int()
         return places
 

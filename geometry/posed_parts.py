@@ -123,7 +123,6 @@ class PosedParts:
         flat = posed.transforms.detach().reshape(-1, body.num_joints, 4, 4).to(verts)
         self.posed_maps = _rows(blend_transforms(flat, weights))
         self.canonical_maps = _rows(blend_transforms(canonical.transforms.to(verts), weights))
-        self._faces32 = self.faces.int().contiguous()
         self.trees = FaceTrees(
             verts, self.faces, self.face_part, self.num_parts, canonical.verts.to(verts)
         )
@@ -144,7 +143,12 @@ class PosedParts:
         count = points.shape[0]
         face = torch.empty(self.num_parts, count, dtype=torch.int32, device=self.device)
         bary = torch.empty(self.num_parts, count, 2, device=self.device)
-        args = [*self.trees.args(), view(self.verts, 3), view(self._faces32, 3), view(points, 3)]
+        args = [
+            *self.trees.args(),
+            view(self.verts, 3),
+            view(self.trees.corners, 3),
+            view(points, 3),
+        ]
         args += [view(body), view(candidates), view(radius), view(face), view(bary, 2)]
         launch(closest_on_parts, count, args, points)
         return face, bary
@@ -182,7 +186,7 @@ class PosedParts:
         uv = torch.zeros(count, 2, device=self.device)
         valid = torch.zeros(count, dtype=torch.bool, device=self.device)
         args = [view(pairs.sample), view(samples.points, 3), view(samples.body)]
-        args += [view(pairs.face), view(pairs.bary, 2), view(self._faces32, 3)]
+        args += [view(pairs.face), view(pairs.bary, 2), view(self.trees.corners, 3)]
         args += [view(self.corner_uv, 2), view(self.posed_maps, 4), view(self.canonical_maps, 4)]
         args += [self.verts.shape[1], 1e-2, view(points, 3), view(uv, 2), view(valid)]
         launch(unskin_pairs, count, args, samples.points)

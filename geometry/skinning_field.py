@@ -187,7 +187,6 @@ class SkinningField:
         self.index = SurfaceIndex(rest.detach(), self.faces, backend)
         self.backend = self.index.backend
         self._posed: SurfaceIndex | None = None
-        self.faces32 = self.faces.int().contiguous()
         self.weights32 = self.weights.float().contiguous()
         # a face at each vertex, -1 for a vertex that no face uses
         self.some_face = torch.full((len(rest),), -1, dtype=torch.int32, device=rest.device)

@@ -6,7 +6,6 @@ exact (envelope theorem for the distance). Reference: C. Ericson, Real-Time Coll
 2005, ch. 5.1.5 (regions of a triangle).
 """
 
-import importlib.util
 import math
 from dataclasses import dataclass
 
@@ -14,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from .backend import choose_backend
 from .errors import BackendError, InputError
 from .face_tree import LIMIT, FaceTrees
 from .norms import safe_norm
@@ -140,13 +140,9 @@ def _search_torch(points: Tensor, verts: Tensor, faces: Tensor) -> Tensor:
     return torch.cat(best) if best else torch.zeros(0, dtype=torch.long, device=points.device)
 
 
-def _choose_backend(backend: str) -> str:
-    if backend not in ("auto", "warp", "torch"):
-        raise InputError(f"backend: expected auto, warp or torch, found {backend!r}; pick one")
-    installed = importlib.util.find_spec("warp") is not None
-    if backend == "warp" and not installed:
-        raise BackendError("backend 'warp' is not installed; run: pip install 'warp-lang>=1.19'")
-    return ("warp" if installed else "torch") if backend == "auto" else backend
+def _reach(max_distance: float) -> float:
+    """Radius of the search: the exact limit is applied to the evaluated distance."""
+    return min(max_distance * (1 + 1e-5) + 1e-7, LIMIT)
 
 
 class SurfaceIndex:
@@ -174,14 +170,14 @@ class SurfaceIndex:
             InputError: faces are empty or out of range, or the backend is unknown.
             BackendError: Warp was asked for by name and is not installed.
         """
-        self.backend = _choose_backend(backend)
+        # of a float32 tensor: whatever the vertices are, the search converts them
+        self.backend = choose_backend(backend, verts.detach().float())
         _check_faces(verts, faces)
         self.faces = faces.long()
         self.verts = verts
         self._tree: FaceTrees | None = None
         if self.backend == "warp":
             self._tree = FaceTrees(verts.detach().float()[None], self.faces)
-            self._corners = self.faces.int().contiguous()
 
     @property
     def tree(self) -> FaceTrees:
@@ -243,14 +239,8 @@ class SurfaceIndex:
 
         queries = points.detach().float().contiguous()
         face = torch.empty(len(queries), dtype=torch.int32, device=points.device)
-        # a little slack: the exact limit is applied to the evaluated distance
-        limit = min(max_distance * (1 + 1e-5) + 1e-7, LIMIT)
-        launch(
-            closest_faces,
-            len(queries),
-            [view(queries, 3), *tree.args(), limit, view(face)],
-            queries,
-        )
+        args = [view(queries, 3), *tree.args(), _reach(max_distance), view(face)]
+        launch(closest_faces, len(queries), args, queries)
         return face
 
     def _hits_of(self, tree: FaceTrees, points: Tensor, max_distance: float) -> SurfaceHit:
@@ -264,8 +254,9 @@ class SurfaceIndex:
         bary, point = torch.empty(2, count, 3, device=device).unbind(0)
         distance = torch.empty(count, device=device)
         found = torch.empty(count, dtype=torch.bool, device=device)
-        args = [view(queries, 3), view(verts, 3), view(self._corners), *tree.args()]
-        args += [min(max_distance, LIMIT), view(face), view(bary, 3), view(point, 3)]
+        args = [view(queries, 3), view(verts, 3), view(tree.corners), *tree.args()]
+        args += [_reach(max_distance), min(max_distance, LIMIT), view(face), view(bary, 3)]
+        args += [view(point, 3)]
         launch(closest_hits, count, [*args, view(distance), view(found)], queries)
         return SurfaceHit(face, bary, point, distance, found)
 

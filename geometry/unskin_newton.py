@@ -117,8 +117,8 @@ def guess_warp(
     guess = torch.empty_like(points)
     hint = torch.empty(len(points), dtype=torch.int32, device=points.device)
     args = [view(points, 3), view(frame), _GRID, view(nearest), *posed.tree.args()]
-    args += [view(field.faces32, 3), min(2 * max_distance, LIMIT), view(rest, 3), view(skinned, 3)]
-    args += [view(inverse, 3), view(field.some_face), view(guess, 3), view(hint)]
+    args += [view(posed.tree.corners, 3), min(2 * max_distance, LIMIT), view(rest, 3)]
+    args += [view(skinned, 3), view(inverse, 3), view(field.some_face), view(guess, 3), view(hint)]
     launch(first_guess, len(points), args, points)
     return guess, hint
 
@@ -178,7 +178,7 @@ def newton_warp(
     order = by_voxel(guess, field.rest)
     args = [view(order), view(points, 3), view(guess, 3), view(hint)]
     args += [view(field.index.tree.places), *field.index.tree.args()]
-    args += [view(field.rest.detach().contiguous(), 3), view(field.faces32, 3)]
+    args += [view(field.rest.detach().contiguous(), 3), view(field.index.tree.corners, 3)]
     args += [view(maps, 4), view(field.weights32), view(bones.joints, 3), view(bones.inverses, 4)]
     args += [plan.starts, plan.iterations, int(plan.gradients), limits]
     out = [view(rest, 3), view(weights), view(face), view(residual), view(invertible)]

@@ -290,6 +290,7 @@ def closest_hits(
     boxes: wp.array2d(dtype=wp.float32),
     tris: wp.array2d(dtype=wp.float32),
     faces: wp.array(dtype=wp.int32),
+    reach: float,
     limit: float,
     face: wp.array(dtype=wp.int64),
     bary: wp.array(dtype=wp.vec3),
@@ -297,10 +298,12 @@ def closest_hits(
     distance: wp.array(dtype=wp.float32),
     found: wp.array(dtype=wp.bool),
 ):
-    """Closest face of each point, and barycentrics, surface point and distance on it."""
+    """Closest face of each point, and barycentrics, surface point and distance on it.
+
+    The search goes to ``reach``; a face is found where the evaluated distance is at most ``limit``.
+    """
     i = start + wp.tid()
     p = points[i]
-    reach = limit * (1.0 + 1.0e-5) + 1.0e-7  # the exact limit is applied to the evaluated distance
     f = closest_in_tree(p, layout, boxes, tris, faces, 0, wp.int64(0), reach * reach)
     on = wp.max(f, 0)
     a = verts[corners[on, 0]]

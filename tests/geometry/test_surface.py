@@ -7,6 +7,7 @@ import oracles
 import pytest
 import torch
 
+from monopart.geometry import backend as backends
 from monopart.geometry import surface
 from monopart.geometry.body import BodyModel
 from monopart.geometry.errors import BackendError, InputError
@@ -261,7 +262,7 @@ def test_backends_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert SurfaceIndex(TRIANGLE, faces).backend == "warp"
     with pytest.raises(InputError, match="'fast'"):
         SurfaceIndex(TRIANGLE, faces, "fast")
-    monkeypatch.setattr(surface.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr(backends, "warp_is_installed", lambda: False)
     assert SurfaceIndex(TRIANGLE, faces).backend == "torch"
     with pytest.raises(BackendError, match="pip install"):
         SurfaceIndex(TRIANGLE, faces, "warp")
