@@ -231,7 +231,7 @@ class _WarpHashGrid(torch.autograd.Function):
         layout: tuple[Tensor, ...],
         own: Tensor | None,
     ) -> Tensor:
-        from monopart.geometry.kernels.launch import launch, view
+        from monopart.geometry.kernels.launch import launch, view, view_rows
 
         from .kernels.hash_grid import forward_kernel
 
@@ -239,7 +239,7 @@ class _WarpHashGrid(torch.autograd.Function):
         part = layout[0].new_zeros(0) if part is None else part.to(torch.int32).contiguous()
         n, features = points.shape[0], table.shape[1]
         out = points.new_empty(n, layout[0].shape[1] * features)
-        args = [view(points, 3), view(part), _table_rows(table), *map(view, layout)]
+        args = [view(points, 3), view(part), view_rows(table), *map(view, layout)]
         launch(forward_kernel(features), n, [*args, _level_rows(out, features)], points)
         ctx.save_for_backward(points, table, part, *layout)
         ctx.own = own
@@ -268,14 +268,6 @@ class _WarpHashGrid(torch.autograd.Function):
         return grad_points, None, None, None, None
 
 
-def _table_rows(table: Tensor) -> Any:
-    """View [T, F] as T rows of F numbers."""
-    from monopart.geometry.kernels.launch import view
-
-    features = table.shape[1]
-    return view(table if features > 1 else table.view(-1), features)
-
-
 def _level_rows(values: Tensor, features: int) -> Any:
     """View [N, L·F] as [N, L] rows of F numbers."""
     from monopart.geometry.kernels.launch import view
@@ -294,13 +286,13 @@ def _zeros_like(table: Tensor) -> Tensor:
 def _points_gradient(
     points: Tensor, table: Tensor, part: Tensor, layout: list[Tensor], cotangent: Tensor
 ) -> Tensor:
-    from monopart.geometry.kernels.launch import launch, view
+    from monopart.geometry.kernels.launch import launch, view, view_rows
 
     from .kernels.hash_grid import points_kernel
 
     features = table.shape[1]
     grad = torch.empty_like(points)
-    args = [view(points, 3), view(part), _table_rows(table), *map(view, layout)]
+    args = [view(points, 3), view(part), view_rows(table), *map(view, layout)]
     args += [_level_rows(cotangent, features), view(grad, 3)]
     launch(points_kernel(features), len(points), args, points)
     return grad
@@ -314,7 +306,7 @@ def _add_table_gradient(
     layout: list[Tensor],
     cotangent: Tensor,
 ) -> None:
-    from monopart.geometry.kernels.launch import launch_jobs, view
+    from monopart.geometry.kernels.launch import launch_jobs, view, view_rows
 
     from .kernels.hash_grid import table_kernel
 
@@ -325,7 +317,7 @@ def _add_table_gradient(
     jobs = 1 if cuda else min(levels, torch.get_num_threads())
     launch_jobs(
         table_kernel(features),
-        [[*args, job, jobs, _table_rows(grad)] for job in range(jobs)],
+        [[*args, job, jobs, view_rows(grad)] for job in range(jobs)],
         len(points),
         points,
     )

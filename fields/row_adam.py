@@ -98,24 +98,16 @@ def row_adam(
     if chosen == "torch":
         _row_adam_torch(table, grad, moments, (now, scaled, root), rule, decay)
         return
-    from monopart.geometry.kernels.launch import launch, view
+    from monopart.geometry.kernels.launch import launch, view, view_rows
 
     from .kernels.adam import row_adam_kernel
 
     rows, features = table.shape
     block = _BLOCK if table.device.type == "cpu" else 1
     args = [rows, block, now, scaled, root, rule.eps, beta1, beta2, view(decay, 3)]
-    args += [_as_rows(t) for t in (grad, table, moments.mean, moments.square)]
+    args += [view_rows(t) for t in (grad, table, moments.mean, moments.square)]
     items = -(-rows // block)
     launch(row_adam_kernel(features), items, [*args, view(moments.seen)], table)
-
-
-def _as_rows(values: Tensor) -> Any:
-    """View [R, F] as R rows of F numbers."""
-    from monopart.geometry.kernels.launch import view
-
-    features = values.shape[1]
-    return view(values if features > 1 else values.view(-1), features)
 
 
 def _row_adam_torch(

@@ -17,9 +17,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .body import BodyModel
-from .face_tree import LIMIT
 from .skinning_field import SkinningField
-from .unskin_newton import ARRIVED, MIN_DET, Bones, Plan, Roots, by_voxel
+from .unskin_newton import Bones, Plan, Roots, by_voxel, run_solver
 from .weight_grid import diffuse_weights
 
 _VOXEL, _REACH = 0.015, 0.1
@@ -186,21 +185,12 @@ def newton_cells(
         The roots (their faces are cells), and their weights [N, J].
     """
     from .kernels.diffused import solve_cells
-    from .kernels.launch import launch, view
+    from .kernels.launch import view
 
-    grid, count, device = field.grid, len(points), points.device
+    grid = field.grid
     points, maps, guess = points.contiguous(), maps.contiguous(), guess.contiguous()
-    rest = torch.empty_like(points)
-    weights = torch.empty(count, grid.weights.shape[1], device=device)
-    cell = torch.empty(count, dtype=torch.int32, device=device)
-    residual = torch.empty(count, device=device)
-    invertible = torch.empty(count, dtype=torch.bool, device=device)
-    limits = (plan.stop, ARRIVED, MIN_DET, min(plan.max_distance, LIMIT))
     args = [view(by_voxel(guess, field.rest)), view(points, 3), view(guess, 3)]
     args += [grid.lo, grid.size, grid.voxel, view(grid.slots), view(grid.cells)]
     args += [view(grid.distance), view(maps, 4), view(grid.weights), view(bones.joints, 3)]
-    args += [view(bones.inverses, 4), plan.starts, plan.iterations, int(plan.gradients), limits]
-    out = [view(rest, 3), view(weights), view(cell), view(residual), view(invertible)]
-    launch(solve_cells, count, [*args, *out], points)
-    residual = torch.where(cell >= 0, residual, math.inf)
-    return Roots(rest, cell.clamp(min=0).long(), residual, invertible), weights
+    args += [view(bones.inverses, 4)]
+    return run_solver(solve_cells, args, points, plan, grid.weights.shape[1])

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -160,7 +161,7 @@ def newton_warp(
     Returns:
         The roots, and their weights [N, J].
     """
-    from .kernels.launch import launch, view
+    from .kernels.launch import view
     from .kernels.newton import solve
 
     points, maps = points.contiguous(), maps.contiguous()
@@ -168,23 +169,44 @@ def newton_warp(
         guess, hint = guess_warp(field, points, maps, plan.max_distance)
     else:
         hint = torch.full((len(points),), -1, dtype=torch.int32, device=points.device)
-    count, device = len(points), points.device
-    rest = torch.empty_like(points)
-    weights = torch.empty(count, field.weights.shape[1], device=device)
-    face = torch.empty(count, dtype=torch.int32, device=device)
-    residual = torch.empty(count, device=device)
-    invertible = torch.empty(count, dtype=torch.bool, device=device)
-    limits = (plan.stop, ARRIVED, MIN_DET, min(plan.max_distance, LIMIT))
     order = by_voxel(guess, field.rest)
     args = [view(order), view(points, 3), view(guess, 3), view(hint)]
     args += [view(field.index.tree.places), *field.index.tree.args()]
     args += [view(field.rest.detach().contiguous(), 3), view(field.index.tree.corners, 3)]
     args += [view(maps, 4), view(field.weights32), view(bones.joints, 3), view(bones.inverses, 4)]
-    args += [plan.starts, plan.iterations, int(plan.gradients), limits]
-    out = [view(rest, 3), view(weights), view(face), view(residual), view(invertible)]
-    launch(solve, count, [*args, *out], points)
-    residual = torch.where(face >= 0, residual, math.inf)
-    return Roots(rest, face.clamp(min=0).long(), residual, invertible), weights
+    return run_solver(solve, args, points, plan, field.weights.shape[1])
+
+
+def run_solver(
+    kernel: Any, args: list[Any], points: Float[Tensor, "n 3"], plan: Plan, joints: int
+) -> tuple[Roots, Float[Tensor, "n J"]]:
+    """Launch a kernel that solves every point: limits and results are the same for all fields.
+
+    Args:
+        kernel: takes ``args``, then starts, iterations, gradients and limits of the plan, then rest
+            points, weights, faces or cells (-1: none), residuals and invertibility to write.
+        args: launch arguments of the field.
+        points: targets.
+        plan: how to search.
+        joints: columns of the weights.
+
+    Returns:
+        The roots, and their weights [N, J].
+    """
+    from .kernels.launch import launch, view
+
+    count, device = len(points), points.device
+    rest = torch.empty_like(points)
+    weights = torch.empty(count, joints, device=device)
+    place = torch.empty(count, dtype=torch.int32, device=device)
+    residual = torch.empty(count, device=device)
+    invertible = torch.empty(count, dtype=torch.bool, device=device)
+    limits = (plan.stop, ARRIVED, MIN_DET, min(plan.max_distance, LIMIT))
+    search = [plan.starts, plan.iterations, int(plan.gradients), limits]
+    out = [view(rest, 3), view(weights), view(place), view(residual), view(invertible)]
+    launch(kernel, count, [*args, *search, *out], points)
+    residual = torch.where(place >= 0, residual, math.inf)
+    return Roots(rest, place.clamp(min=0).long(), residual, invertible), weights
 
 
 def newton_torch(

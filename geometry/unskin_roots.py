@@ -92,13 +92,13 @@ def inverse_skin_all(
     maps = query.field.maps(query.posed.transforms)
     with torch.no_grad():
         found = _every_start(query, maps.detach(), plan)
-        picks, kept = _distinct(found, query.sound, apart, most)
+        picks = _distinct(found, query.sound, apart, most)
     results = [attach(query, maps, *pick) for pick in picks]
     return UnskinnedRoots(
         torch.stack([rest for rest, _ in results], 1),
         torch.stack([weights for _, weights in results], 1),
         torch.stack([pick[0].residual for pick in picks], 1),
-        torch.stack(kept, 1),
+        torch.stack([pick[2] for pick in picks], 1),
     )
 
 
@@ -120,30 +120,22 @@ def _every_start(query: Query, maps: Tensor, plan: Plan) -> list[tuple[Roots, Te
 
 def _distinct(
     found: list[tuple[Roots, Tensor]], sound: Tensor, apart: float, most: int
-) -> tuple[list[tuple[Roots, Tensor, Tensor]], list[Tensor]]:
-    """Roots of each point that are not the same, smallest residual first: the picks, and masks."""
+) -> list[tuple[Roots, Tensor, Tensor]]:
+    """Roots of each point that are not the same, their weights and masks, best first."""
     points = torch.stack([roots.points for roots, _ in found])
     residual = torch.stack([roots.residual for roots, _ in found])
     valid = torch.stack([r.invertible & (r.residual <= ARRIVED) for r, _ in found]) & sound
     open_ = torch.where(valid, residual, torch.inf)
     rows = torch.arange(points.shape[1], device=points.device)
-    picks, kept, first = [], [], rows
+    faces = torch.stack([roots.face for roots, _ in found])
+    weights = torch.stack([own for _, own in found])
+    picks, first = [], open_.argmin(0)
     for _ in range(most):
         best, which = open_.min(0)
         there = best.isfinite()
-        first = which if not picks else first
         which = torch.where(there, which, first)
-        roots = Roots(
-            points[which, rows],
-            torch.stack([r.face for r, _ in found])[which, rows],
-            best,
-            there,
-        )
-        weights = torch.zeros_like(found[0][1])
-        for start, (_, own) in enumerate(found):
-            weights = torch.where((there & (which == start))[:, None], own, weights)
-        picks.append((roots, weights, there))
-        kept.append(there)
+        roots = Roots(points[which, rows], faces[which, rows], best, there)
+        picks.append((roots, torch.where(there[:, None], weights[which, rows], 0.0), there))
         near = (points - roots.points).norm(dim=-1) <= apart
         open_ = torch.where(near & there, torch.inf, open_)
-    return picks, kept
+    return picks

@@ -60,6 +60,19 @@ def view(tensor: Tensor, vector: int = 1) -> Any:
     return argument
 
 
+def view_rows(table: Tensor) -> Any:
+    """Warp's view of a table [R, F] as R rows: vectors of 2, 3 or 4 floats, or single ones.
+
+    Args:
+        table: contiguous float32, F from 1 to 4.
+
+    Returns:
+        A launch argument.
+    """
+    width = table.shape[1]
+    return view(table if width > 1 else table.view(-1), width)
+
+
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="warp")

@@ -14,19 +14,16 @@ wp.set_module_options({"enable_backward": False})  # gradients are kernels of th
 
 
 @no_type_check
-@wp.kernel
-def skin_points(
-    start: int,
-    points: wp.array(dtype=wp.vec3),
+@wp.func
+def blended(
     rows: wp.array(dtype=wp.vec4),
     starts: wp.array(dtype=wp.int32),
     joints: wp.array(dtype=wp.int32),
     weights: wp.array(dtype=wp.float32),
     num_joints: int,
-    posed: wp.array(dtype=wp.vec3),
+    i: int,
 ):
-    """Posed vertices x = Σ_j w_j (R_j p + t_j); one item per body and vertex."""
-    i = start + wp.tid()
+    """Upper rows of the blended map of item ``i``, a vertex of a body."""
     num_verts = starts.shape[0] - 1
     body = i // num_verts
     v = i - body * num_verts
@@ -40,6 +37,24 @@ def skin_points(
         a += w * rows[row]
         b += w * rows[row + 1]
         c += w * rows[row + 2]
+    return a, b, c
+
+
+@no_type_check
+@wp.kernel
+def skin_points(
+    start: int,
+    points: wp.array(dtype=wp.vec3),
+    rows: wp.array(dtype=wp.vec4),
+    starts: wp.array(dtype=wp.int32),
+    joints: wp.array(dtype=wp.int32),
+    weights: wp.array(dtype=wp.float32),
+    num_joints: int,
+    posed: wp.array(dtype=wp.vec3),
+):
+    """Posed vertices x = Σ_j w_j (R_j p + t_j); one item per body and vertex."""
+    i = start + wp.tid()
+    a, b, c = blended(rows, starts, joints, weights, num_joints, i)
     p = points[i]
     q = wp.vec4(p[0], p[1], p[2], 1.0)
     posed[i] = wp.vec3(wp.dot(a, q), wp.dot(b, q), wp.dot(c, q))
@@ -59,19 +74,7 @@ def points_gradient(
 ):
     """Gradient of the rest vertices Σ_j w_j R_jᵀ g; one item per body and vertex."""
     i = start + wp.tid()
-    num_verts = starts.shape[0] - 1
-    body = i // num_verts
-    v = i - body * num_verts
-    first = body * num_joints
-    a = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    b = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    c = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    for e in range(starts[v], starts[v + 1]):
-        row = 4 * (first + joints[e])
-        w = weights[e]
-        a += w * rows[row]
-        b += w * rows[row + 1]
-        c += w * rows[row + 2]
+    a, b, c = blended(rows, starts, joints, weights, num_joints, i)
     g = cotangent[i]
     total = a * g[0] + b * g[1] + c * g[2]
     grad[i] = wp.vec3(total[0], total[1], total[2])
