@@ -69,6 +69,21 @@ def test_the_same_seed_gives_the_same_file(runs: dict[str, tuple[Path, Avatar]])
     assert files["two"] != files["other"], "the seed decides nothing"
 
 
+def test_gradients_repeat_on_two_threads(runs: dict[str, tuple[Path, Avatar]]) -> None:
+    avatar = runs["other"][1]
+    found = set()
+    with threads(2):
+        trainer = Trainer(avatar)
+        for _ in range(8):
+            trainer.generator.manual_seed(0)
+            avatar.model.zero_grad(set_to_none=True)
+            terms, _ = trainer.losses(0, 1.0)
+            torch.stack(list(terms.values())).sum().backward()
+            grads = [p.grad for p in avatar.model.parameters() if p.grad is not None]
+            found.add(b"".join(g.numpy().tobytes() for g in grads))
+    assert len(found) == 1
+
+
 def test_threads_change_little(runs: dict[str, tuple[Path, Avatar]]) -> None:
     images = {n: render_view(a, view_of(a.record, 1, 1)).color for n, (_, a) in runs.items()}
     assert float((images["one"] - images["two"]).abs().mean()) <= THREADS_BOUND
