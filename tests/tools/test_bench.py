@@ -3,8 +3,10 @@
 No time is asserted: only that the clocks, the errors and the files are there.
 """
 
+import importlib.util
 import json
 import math
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,7 +21,7 @@ from monopart.tools.bench.bodies import near_points, pose_list, surface_data
 from monopart.tools.bench.cli import main
 from monopart.tools.bench.meshes import subdivided
 from monopart.tools.bench.plots import Dots, log_plot, pareto_front
-from monopart.tools.bench.registry import Method, Operation, Problem, Settings
+from monopart.tools.bench.registry import Method, Operation, Problem, Settings, load_open3d
 from monopart.tools.bench.scaling import exponents
 from monopart.tools.bench.show import cells, markdown
 from monopart.tools.bench.skinning_methods import plain_arrays, plain_skinning
@@ -206,6 +208,16 @@ def test_slow_methods_run_once_and_rare_ones_seldom() -> None:
     assert "| **ours** |" in markdown(results.Report("x", False, suite.environment(), [table]))
     said = {s.method: cells(s)[-1] for s in results.summarise(table)}
     assert said == {"ours": "", "single": "", "rare": "on 1 of 3 problems"}
+
+
+def test_open3d_needs_nothing_to_draw_with() -> None:
+    if importlib.util.find_spec("open3d") is None:
+        pytest.skip("Open3D is not installed")
+    before = {name for name in ("dash", "plotly", "plotly.graph_objects") if name in sys.modules}
+    assert load_open3d().core.Tensor([1.0]).shape[0] == 1
+    if importlib.util.find_spec("dash") is None:
+        assert "dash" not in sys.modules
+    assert before <= set(sys.modules)
 
 
 def test_measure_takes_turns() -> None:

@@ -2,6 +2,8 @@
 
 import importlib
 import importlib.util
+import sys
+import types
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -115,3 +117,36 @@ class Operation:
 def load(name: str) -> Any:
     """A module of a peer, untyped: the type checker need not find it."""
     return importlib.import_module(name)
+
+
+_DISPLAYS = ("dash", "plotly", "plotly.graph_objects")
+
+
+class _Nothing(types.ModuleType):
+    """In the place of a module of which nothing is used."""
+
+    __path__ = []  # noqa: RUF012 - a module may be looked into: a package without modules
+
+    def __getattr__(self, name: str) -> type:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return object
+
+
+def load_open3d() -> Any:
+    """Open3D, which can be imported here without the packages that it draws with.
+
+    It imports a web server for its figures (and pytest breaks on that server's plugin); where one
+    is not installed, an empty module stands in its place during the import, and is gone after it.
+
+    Raises:
+        ImportError: Open3D is not installed or does not run.
+    """
+    missing = [n for n in _DISPLAYS if importlib.util.find_spec(n.partition(".")[0]) is None]
+    stand_ins = {name: _Nothing(name) for name in missing if name not in sys.modules}
+    sys.modules.update(stand_ins)
+    try:
+        return load("open3d")
+    finally:
+        for name in stand_ins:
+            del sys.modules[name]

@@ -23,6 +23,7 @@ from .meshes import subdivided
 from .registry import Method, Operation, Problem, Settings
 from .results import Report, Table, summarise
 from .scaling_geometry import geometry_axes
+from .timing import with_threads
 
 RAYS = 2048
 
@@ -104,28 +105,13 @@ def _rays(parts: PosedParts, owner: Tensor, count: int) -> Rays:
     return Rays(origins, directions)
 
 
-def _with_threads(data: StepData, call: Callable[[], Any]) -> Callable[[], Any]:
-    if not data.threads:
-        return call
-
-    def limited() -> Any:
-        before = torch.get_num_threads()
-        torch.set_num_threads(data.threads)
-        try:
-            return call()
-        finally:
-            torch.set_num_threads(before)
-
-    return limited
-
-
 def _render(data: StepData) -> Callable[[], dict[str, int]]:
     def call() -> dict[str, int]:
         data.model.eval()
         with torch.no_grad():
             return data.model.render_rays(data.parts, data.inputs, data.rays, data.owner).stats
 
-    return _with_threads(data, call)
+    return with_threads(data.threads, call)
 
 
 def _train(data: StepData) -> Callable[[], dict[str, int]]:
@@ -138,7 +124,7 @@ def _train(data: StepData) -> Callable[[], dict[str, int]]:
         torch.autograd.grad(loss, parameters, allow_unused=True)
         return out.stats
 
-    return _with_threads(data, call)
+    return with_threads(data.threads, call)
 
 
 def _judge(data: StepData, stats: dict[str, int]) -> dict[str, float]:

@@ -16,6 +16,7 @@ from monopart.geometry.unskin import inverse_skin
 from .bodies import SurfaceData, joint_limits, pose_list, surface_data
 from .meshes import subdivided
 from .registry import Method, Operation, Problem, Settings
+from .timing import with_threads
 
 POINTS = 32_768
 BODIES = 8
@@ -70,25 +71,10 @@ def _posed(body: BodyModel, points: int = POINTS, threads: int = 0) -> Scaled:
     return Scaled(surface_data(body, full, points, shift=0.0), threads)
 
 
-def _limited(data: Scaled, call: Callable[[], Any]) -> Callable[[], Any]:
-    if not data.threads:
-        return call
-
-    def limited() -> Any:
-        before = torch.get_num_threads()
-        torch.set_num_threads(data.threads)
-        try:
-            return call()
-        finally:
-            torch.set_num_threads(before)
-
-    return limited
-
-
 def _closest(data: Scaled) -> Callable[[], Any]:
     own = data.surface
     index = SurfaceIndex(own.verts, own.faces)
-    return _limited(data, lambda: index.query(own.points))
+    return with_threads(data.threads, lambda: index.query(own.points))
 
 
 def _unskin(data: Scaled) -> Callable[[], Any]:
@@ -97,7 +83,7 @@ def _unskin(data: Scaled) -> Callable[[], Any]:
     def call() -> Any:
         return inverse_skin(own.points, own.posed, own.body, rest_verts=own.rest)
 
-    return _limited(data, call)
+    return with_threads(data.threads, call)
 
 
 def _skin(data: Scaled) -> Callable[[], Any]:
@@ -111,7 +97,7 @@ def _skin(data: Scaled) -> Callable[[], Any]:
         verts = body(BodyPose(turned, betas, still, still)).verts
         return torch.autograd.grad(verts.square().mean(), turned)
 
-    return _limited(data, call)
+    return with_threads(data.threads, call)
 
 
 def _refined(levels: int) -> BodyModel:

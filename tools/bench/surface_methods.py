@@ -13,7 +13,7 @@ import numpy as np
 from monopart.geometry.surface import SurfaceIndex
 
 from .bodies import SurfaceData, barycentrics
-from .registry import Method, load
+from .registry import Method, load, load_open3d
 
 Found = tuple[np.ndarray, np.ndarray]
 """Faces [N] and barycentrics [N, 3]."""
@@ -90,7 +90,7 @@ class Open3D(Peer):
 
     def __init__(self, data: SurfaceData) -> None:
         """Build the scene."""
-        self.o3d = load("open3d")
+        self.o3d = load_open3d()
         points, verts, faces = _single(data)
         self.points = self.o3d.core.Tensor(points)
         self.faces = self.o3d.core.Tensor(faces.astype(np.uint32))
@@ -294,7 +294,7 @@ def _pykdtree(data: SurfaceData) -> Callable[[], Any]:
 
 
 def _open3d_nearest(data: SurfaceData) -> Callable[[], Any]:
-    core = load("open3d").core
+    core = load_open3d().core
     search = core.nns.NearestNeighborSearch(core.Tensor(data.verts.numpy()))
     search.knn_index()
     points = core.Tensor(data.points.numpy())

@@ -116,3 +116,24 @@ def measure(
             gc.enable()
     timings = {name: Timing(spread(walls[name]), spread(cpus[name])) for name in names}
     return timings, results
+
+
+def with_threads(threads: int, call: Callable[[], Any]) -> Callable[[], Any]:
+    """A call that runs with a number of threads of its own.
+
+    Args:
+        threads: of torch and Warp; 0 leaves them as they are.
+        call: what to run.
+    """
+    if not threads:
+        return call
+
+    def limited() -> Any:
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            return call()
+        finally:
+            torch.set_num_threads(before)
+
+    return limited
