@@ -248,6 +248,9 @@ def test_bad_input() -> None:
         BodyShell(verts, faces, torch.tensor([0.1]), torch.tensor([1]))
     with pytest.raises(InputError, match="NaN"):
         BodyShell(verts * float("nan"), faces, 0.1)
+    for unit in (1e3, 1e12):  # millimetres, and what no whole number of 32 bits counts
+        with pytest.raises(InputError, match="in metres"):
+            BodyShell(unit * verts, faces, 0.1)
     shell = BodyShell(verts, faces, 0.1)
     with pytest.raises(InputError, match="step"):
         shell.sample(Rays(verts, verts), 0.0)
