@@ -143,7 +143,7 @@ GEOMETRY = (
         "geometry/cameras.py",
         "plane @ K[:2, :2].mT + K[:2, 2]",
         "plane @ K[:2, :2] + K[:2, 2]",
-        _geometry("cameras"),
+        (*_geometry("cameras"), "tests/properties/test_cameras_and_boxes.py"),
     ),
     Mutant(
         "a tangential term of the lens's Jacobian",
@@ -312,7 +312,7 @@ TOOLKIT = (
         "    two = pairs.bary[rows]\n"
         "    full = torch.cat([two, 1 - two.sum(-1, keepdim=True)], -1)\n"
         "    hit = type(hit)(pairs.face[rows], full, hit.uv, hit.found)\n",
-        _toolkit("model", "metamorphic"),
+        _toolkit("losses"),
     ),
     Mutant(
         "the background of the target lies on the person",
@@ -320,7 +320,7 @@ TOOLKIT = (
         "toolkit/train.py",
         "(~batch.mask)[:, None] * ground",
         "batch.mask[:, None] * ground",
-        _toolkit("model", "metamorphic"),
+        _toolkit("losses"),
     ),
     Mutant(
         "gradients of appearance codes add up in any order",
