@@ -1,7 +1,7 @@
 """Multiresolution hash grids, one per part, in a single table."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,6 +81,9 @@ class HashGrid(torch.nn.Module):
         accumulate: the Warp backward pass adds to ``table.grad`` in place in place of handing a
             new gradient of the whole table to autograd, for an optimiser that zeroes what it used
             (:class:`RowAdam`). ``torch.autograd.grad`` then finds none for the table.
+        deterministic: on CUDA the backward pass sorts the gradient of the table by row and sums it
+            in one order, in place of atomic sums whose order, and so rounding, changes from run to
+            run; slower. The CPU always sums in one order.
 
     Reference: Müller et al., Instant Neural Graphics Primitives, 2022, section 3.
 
@@ -130,6 +133,7 @@ class HashGrid(torch.nn.Module):
         table = torch.rand(total, self.features, generator=generator)
         self.table = torch.nn.Parameter((table * 2 - 1) * _INIT)
         self.accumulate = False
+        self.deterministic = False
 
     @property
     def out_features(self) -> int:
@@ -173,7 +177,7 @@ class HashGrid(torch.nn.Module):
             layout = (self.offsets, self.masks, self.resolutions)
             # a table put in by functional_call has no .grad of its own
             own = self.table if self.accumulate and self.table.is_leaf else None
-            return _WarpHashGrid.apply(points, self.table, part, layout, own)
+            return _WarpHashGrid.apply(points, self.table, part, layout, own, self.deterministic)
         if backend == "auto":
             return self._forward_torch(points, part)
         raise BackendError(
@@ -197,26 +201,29 @@ class HashGrid(torch.nn.Module):
 
     def _forward_torch(self, points: Tensor, part: Tensor | None) -> Tensor:
         """Look up all corners of all levels at once: the readable twin of the kernels."""
-        k = torch.zeros_like(points[:, 0], dtype=torch.long) if part is None else part.long()
-        res = self.resolutions[k].long()[..., None]  # [N, L, 1]
-        position = points.clamp(0, 1)[:, None, :] * res
-        cell = position.detach().long().clamp_min(0).minimum(res - 1)  # 1 is in the last cell
-        inside = position - cell
         out = points.new_zeros(())
-        for corner in ((x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)):
-            offset = torch.tensor(corner, device=points.device)
-            x, y, z = torch.where(offset == 1, inside, 1 - inside).unbind(-1)
-            out = out + (x * y * z)[..., None] * self.table[self._row(cell + offset, k)]
+        for row, share in _corners(points, part, (self.offsets, self.masks, self.resolutions)):
+            out = out + share[..., None] * self.table[row]
         return out.flatten(1)
 
-    def _row(self, vertex: Tensor, k: Tensor) -> Tensor:
-        """Table rows [N, L] of grid vertices [N, L, 3]."""
-        x, y, z = vertex.unbind(-1)
-        n = self.resolutions[k].long() + 1
-        mask = self.masks[k].long()
+
+def _corners(
+    points: Tensor, part: Tensor | None, layout: Sequence[Tensor]
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Table row [N, L] and weight [N, L] of each of the eight corners of the cells of points."""
+    k = torch.zeros_like(points[:, 0], dtype=torch.long) if part is None else part.long()
+    offset, mask, res = (values[k].long() for values in layout)
+    position = points.clamp(0, 1)[:, None, :] * res[..., None]
+    last = res[..., None] - 1  # 1 is in the last cell
+    cell = position.detach().long().clamp_min(0).minimum(last)
+    inside = position - cell
+    for corner in ((x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)):
+        far = torch.tensor(corner, device=points.device)
+        u, v, w = torch.where(far == 1, inside, 1 - inside).unbind(-1)
+        x, y, z = (cell + far).unbind(-1)
         hashed = ((x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])) & mask
-        direct = x + n * (y + n * z)
-        return self.offsets[k].long() + torch.where(mask == 0, direct, hashed)
+        direct = x + (res + 1) * (y + (res + 1) * z)
+        yield offset + torch.where(mask == 0, direct, hashed), u * v * w
 
 
 class _WarpHashGrid(torch.autograd.Function):
@@ -230,6 +237,7 @@ class _WarpHashGrid(torch.autograd.Function):
         part: Tensor | None,
         layout: tuple[Tensor, ...],
         own: Tensor | None,
+        deterministic: bool,
     ) -> Tensor:
         from monopart.geometry.kernels.launch import launch, view, view_rows
 
@@ -243,6 +251,7 @@ class _WarpHashGrid(torch.autograd.Function):
         launch(forward_kernel(features), n, [*args, _level_rows(out, features)], points)
         ctx.save_for_backward(points, table, part, *layout)
         ctx.own = own
+        ctx.sorts = deterministic and points.device.type == "cuda"
         return out
 
     @staticmethod
@@ -256,16 +265,18 @@ class _WarpHashGrid(torch.autograd.Function):
         cotangent = cotangents[0].contiguous()
         saved = (points, table, part, layout, cotangent)
         grad_points = _points_gradient(*saved) if ctx.needs_input_grad[0] else None
+        rest = (None, None, None, None)
         if not ctx.needs_input_grad[1]:
-            return grad_points, None, None, None, None
+            return grad_points, None, *rest
+        add = _add_sorted_gradient if ctx.sorts else _add_table_gradient
         if ctx.own is None:
             grad_table = _zeros_like(table)
-            _add_table_gradient(grad_table, *saved)
-            return grad_points, grad_table, None, None, None
+            add(grad_table, *saved)
+            return grad_points, grad_table, *rest
         if ctx.own.grad is None:
             ctx.own.grad = _zeros_like(table)
-        _add_table_gradient(ctx.own.grad, *saved)
-        return grad_points, None, None, None, None
+        add(ctx.own.grad, *saved)
+        return grad_points, None, *rest
 
 
 def _level_rows(values: Tensor, features: int) -> Any:
@@ -321,3 +332,17 @@ def _add_table_gradient(
         len(points),
         points,
     )
+
+
+def _add_sorted_gradient(
+    grad: Tensor,
+    points: Tensor,
+    table: Tensor,
+    part: Tensor,
+    layout: list[Tensor],
+    cotangent: Tensor,
+) -> None:
+    """As `_add_table_gradient`; on CUDA this sum of torch sorts by row and has one order."""
+    by_level = cotangent.unflatten(1, (-1, table.shape[1]))
+    for row, share in _corners(points, part if len(part) else None, layout):
+        grad.index_put_((row,), share[..., None] * by_level, accumulate=True)

@@ -15,6 +15,8 @@ from torch import Tensor
 from .cameras import Rays
 from .errors import InputError
 
+_MOST_VOXELS = 2**31 - 1  # the kernels number them with 32 bits
+
 
 @dataclass(frozen=True)
 class ShellSamples:
@@ -114,8 +116,8 @@ class BodyShell:
                 where a caller kept it; no voxel is then marked.
 
         Raises:
-            InputError: radius or voxel not positive, more than 31 parts, non-finite vertices, or a
-                grid of another size.
+            InputError: radius or voxel not positive, more than 31 parts, non-finite vertices, more
+                than 2³¹ voxels (vertices in millimetres, say), or a grid of another size.
         """
         verts = verts.detach().reshape(-1, *verts.shape[-2:]).float()
         parts = torch.zeros_like(faces[:, 0]) if face_part is None else face_part
@@ -143,6 +145,12 @@ class BodyShell:
         margin = float(reach.max())
         self.lo = (verts.amin(1) - margin).contiguous()
         extent = verts.amax(1) + margin - self.lo
+        wanted = float((extent.double() / self.voxel).ceil().prod(1).sum())
+        if wanted > _MOST_VOXELS:
+            raise InputError(
+                f"verts: expected bodies of at most {_MOST_VOXELS} voxels of {self.voxel} m, found "
+                f"{wanted:.3g}; state vertices in metres, or the voxel in their unit"
+            )
         self.dims = (extent / self.voxel).ceil().int().clamp(min=1).contiguous()
         cells = self.dims.long().prod(1)
         self.offset = (cells.cumsum(0) - cells).contiguous()

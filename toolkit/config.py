@@ -125,6 +125,9 @@ class TrainConfig:
     """Composite rendering and target over a random colour in training."""
     occupancy: bool = True
     """Learn which canonical cells are empty and skip them in training (approximate)."""
+    deterministic: bool = False
+    """On CUDA, sum gradients in one order, so that a seed repeats a run bit for bit; slower. The
+    CPU always does."""
     checkpoint_seconds: float = 60.0
     """Wall-clock seconds between two saved checkpoints."""
     log_every: int = 20

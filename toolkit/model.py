@@ -222,7 +222,8 @@ class AvatarModel(torch.nn.Module):
         with stage("colour"):
             rows = union.winner if skip.colors else torch.arange(len(sigma))
             counted = union.counts if skip.colors else pairs.counts
-            code = None if frames.code is None else frames.code[owner[rows]]
+            # index_select: the gradient of [] adds up in an order that changes with two threads
+            code = None if frames.code is None else frames.code.index_select(0, owner[rows])
             rgb = self.field.color(encoded[rows], geometry[rows], code, counted)
             shown = rgb if skip.colors else rgb[union.winner]
             color = torch.zeros(total, 3).to(rgb)

@@ -86,11 +86,12 @@ def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam |
 
     Args:
         model: an avatar's model; its hash grids are told how to hand over their gradients.
-        config: rates, and whether tables are stepped row by row.
+        config: rates, whether tables are stepped row by row, and in which order they are summed.
     """
     sparse = config.train.sparse_optimizer
     for grid in _grids(model):
         grid.accumulate = sparse
+        grid.deterministic = config.train.deterministic
     tables = [p for n, p in model.named_parameters() if n.endswith("grid.table")]
     others = [p for n, p in model.named_parameters() if not n.endswith("grid.table")]
     groups = [

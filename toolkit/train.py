@@ -21,6 +21,7 @@ from .avatar import Avatar
 from .captures.cache import Pictures, read_pictures
 from .captures.patches import PixelBatch, PixelSampler
 from .checkpoint import save_weights
+from .determinism import repeatable
 from .losses import color_loss, offset_loss, round_trip_distance
 from .lpips import LPIPS, load_lpips
 from .model import Rendered
@@ -276,7 +277,8 @@ class Trainer:
             done = elapsed / config.seconds if config.seconds else step / config.iterations
             if done >= 1.0:
                 break
-            numbers = self.step(step, done)
+            with repeatable(config.deterministic):
+                numbers = self.step(step, done)
             step += 1
             result.iterations = step
             result.seconds = time.perf_counter() - start

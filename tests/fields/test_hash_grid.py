@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from monopart.fields.hash_grid import GridSpec, HashGrid
+from monopart.fields.hash_grid import (
+    GridSpec,
+    HashGrid,
+    _add_sorted_gradient,
+    _add_table_gradient,
+)
 from monopart.geometry.errors import BackendError, InputError
 
 # three parts with dense and hashed levels in different places
@@ -134,6 +139,38 @@ def test_gradient_is_bitwise_repeatable_on_any_number_of_threads():
         torch.set_num_threads(before)
     for run in runs[1:]:
         assert all(torch.equal(a, b) for a, b in zip(run, runs[0], strict=True))
+
+
+@pytest.mark.parametrize("features", [1, 2, 4])
+def test_sorted_gradient_is_the_gradient(features):
+    """What CUDA runs under `deterministic`, on the CPU."""
+    for parts, n in ((3, 500), (1, 300), (3, 1), (3, 0)):
+        grid = _grid(features, parts)
+        points, part = _points(n)
+        part = part if parts > 1 else torch.zeros(0, dtype=torch.long)
+        layout = [grid.offsets, grid.masks, grid.resolutions]
+        cotangent = torch.randn(n, grid.out_features)
+        found, expected = torch.zeros(2, *grid.table.shape).unbind(0)
+        saved = (points, grid.table.detach(), part.int(), layout, cotangent)
+        _add_sorted_gradient(found, *saved)
+        _add_table_gradient(expected, *saved)
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.gpu
+def test_sorted_gradient_repeats_on_cuda():
+    grid = _grid(2).cuda()
+    grid.deterministic = True
+    points, part = (t.cuda() for t in _points(20000))
+    found = []
+    for _ in range(3):
+        grid.table.grad = None
+        grid(points, part).square().sum().backward()
+        found.append(grid.table.grad.clone())
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
+    grid.deterministic, grid.table.grad = False, None
+    grid(points, part).square().sum().backward()
+    torch.testing.assert_close(grid.table.grad, found[0], atol=1e-2, rtol=1e-3)
 
 
 @pytest.mark.parametrize("backend", ["torch", "warp"])

@@ -219,6 +219,19 @@ def test_rays_that_miss_and_no_rays(shell: BodyShell) -> None:
     assert inside.depth[0].item() == pytest.approx(0.005)  # the lattice starts at the origin
 
 
+def test_nothing_is_lost_around_a_speck_and_little_is_kept() -> None:
+    """A triangle of no size leaves the promise no slack: every point of a ball is tried."""
+    speck, faces = 1e-6 * torch.eye(3), torch.tensor([[0, 1, 2]])
+    way = torch.nn.functional.normalize(torch.randn(20000, 3), dim=-1)
+    for voxel in (0.013, 0.04, 0.3):
+        for _ in range(3):
+            centre = torch.rand(3)
+            shell = BodyShell(speck + centre, faces, 0.05, voxel=voxel)
+            assert bool(shell.occupied(centre + 0.04999 * way).all())
+            beyond = 0.05 + 3**0.5 * voxel + 1e-4  # the far corner of a voxel that is just marked
+            assert not bool(shell.occupied(centre + beyond * way).any())
+
+
 def test_large_triangles_are_covered() -> None:
     """The inside of a triangle is far from its corners, and the shell covers it nevertheless."""
     verts = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.5, 0.866, 0]])
@@ -248,6 +261,9 @@ def test_bad_input() -> None:
         BodyShell(verts, faces, torch.tensor([0.1]), torch.tensor([1]))
     with pytest.raises(InputError, match="NaN"):
         BodyShell(verts * float("nan"), faces, 0.1)
+    for unit in (1e3, 1e12):  # millimetres, and what no whole number of 32 bits counts
+        with pytest.raises(InputError, match="in metres"):
+            BodyShell(unit * verts, faces, 0.1)
     shell = BodyShell(verts, faces, 0.1)
     with pytest.raises(InputError, match="step"):
         shell.sample(Rays(verts, verts), 0.0)

@@ -49,6 +49,8 @@ def test_skipping_does_not_change_the_image(trained: Avatar) -> None:
     assert float(fast.opacity.max()) > 0.5, "an empty picture proves nothing"
     assert float((fast.color - dense.color).abs().max()) <= 1e-4
     assert float((fast.opacity - dense.opacity).abs().max()) <= 1e-4
+    assert float((fast.depth - dense.depth).abs().max()) <= 1e-3  # the actor is 3 m away
+    assert 2.0 < float(fast.depth[fast.opacity > 0.99].mean()) < 4.0
     assert fast.stats["rays"] < dense.stats["rays"]
     assert fast.stats["samples_shell"] < dense.stats["samples_shell"]
     assert fast.stats["pairs_found"] <= dense.stats["pairs_found"]
