@@ -135,10 +135,14 @@ class Cell:
     """The error that stopped it, if any."""
 
     @property
+    def kind(self) -> torch.dtype:
+        """The precision."""
+        return getattr(torch, self.dtype)
+
+    @property
     def ulp(self) -> float | None:
         """The value error in units of the last place of the scale."""
-        kind = getattr(torch, self.dtype)
-        return None if self.value is None else self.value / torch.finfo(kind).eps
+        return None if self.value is None else self.value / torch.finfo(self.kind).eps
 
 
 @dataclass
