@@ -6,8 +6,10 @@ gradients with those in float64, and those in float64 with central differences.
 """
 
 import dataclasses
+import importlib
 import importlib.util
 import json
+import math
 import sys
 import warnings
 import zlib
@@ -47,6 +49,8 @@ class Family:
     """What is not a float: faces, a tree, a camera."""
     cases: int | None = None
     """Largest number of cases."""
+    halves: bool = True
+    """Inside the range of float16 too."""
     slope: float = 1e-4
     """Largest relative error of a float32 gradient; the tests hold it."""
 
@@ -67,6 +71,12 @@ class Way:
     """What must be importable."""
     differentiable: bool = True
     """Whether it has gradients."""
+    serves: Callable[[Family], bool] = lambda family: True
+    """Families that it is made for."""
+    limit: float | None = None
+    """Largest relative error in float32, where it is not that of the operation."""
+    double: float | None = None
+    """The same in float64."""
 
     def absent(self) -> str | None:
         """The first module that is not installed, or None."""
@@ -103,6 +113,8 @@ class Stress:
     """A row of the result depends on the same row of the inputs only, where they have as many."""
     limit: float = 1e-6
     """Largest relative error in float32 inside the domain; the tests hold it."""
+    double: float = 1e-13
+    """The same in float64."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +172,11 @@ class Outcome:
 
 
 def _as_rows(values: np.ndarray) -> np.ndarray:
-    return values.reshape(len(values), -1)
+    return values.reshape(len(values), math.prod(values.shape[1:]))
+
+
+def _flat(values: Tensor) -> Tensor:
+    return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 def _worst(rows: np.ndarray) -> float | None:
@@ -184,7 +200,7 @@ def _gradients(
     leaves = [x.detach().clone().requires_grad_(i in wrt) for i, x in enumerate(inputs)]
     result, valid = _apply(way, family, tuple(leaves))
     weights = _cotangent(result)
-    rows = (result * weights).reshape(len(result), -1).sum(1)
+    rows = _flat(result * weights).sum(1)
     total = torch.where(valid, rows, torch.zeros_like(rows)).sum()
     wanted = [leaves[i] for i in wrt]
     found = torch.autograd.grad(total, wanted, allow_unused=True)
@@ -210,14 +226,14 @@ def _differences(
         for i, direction in zip(wrt, along, strict=True):
             moved[i] = inputs[i] + sign * family.step * direction
         result, valid = _apply(way, family, tuple(moved))
-        rows = (result * _cotangent(result)).reshape(len(result), -1).sum(1)
+        rows = _flat(result * _cotangent(result)).sum(1)
         sums.append(torch.where(valid, rows, torch.zeros_like(rows)))
     slope = (sums[0] - sums[1]) / (2 * family.step)
     count = len(slope)
     parts = [(g * d, g, d) for g, d in zip(gradients, along, strict=True)]
     if stress.rows_apart and all(len(g) == count for g in gradients):
-        told = torch.stack([p.reshape(count, -1).sum(1) for p, _, _ in parts]).sum(0)
-        size = torch.stack([g.reshape(count, -1).norm(dim=1) for _, g, _ in parts]).norm(dim=0)
+        told = torch.stack([_flat(p).sum(1) for p, _, _ in parts]).sum(0)
+        size = torch.stack([_flat(g).norm(dim=1) for _, g, _ in parts]).norm(dim=0)
     else:
         told = torch.stack([p.sum() for p, _, _ in parts]).sum()[None]
         size = torch.stack([g.norm() for _, g, _ in parts]).norm()[None]
@@ -228,7 +244,7 @@ def _differences(
 
 def _largest(values: Tensor) -> Tensor:
     """Largest entry of each row; 0 where there is none."""
-    return values.abs().reshape(len(values), -1).amax(1) if values.numel() else torch.zeros(1)
+    return _flat(values).abs().amax(1) if values.numel() else torch.zeros(1)
 
 
 def _gradient_error(found: list[Tensor], true: list[Tensor]) -> float | None:
@@ -296,7 +312,7 @@ def _slopes(
 ) -> tuple[float | None, float | None, int]:
     """Error of the gradient, amplification, and how many gradients are not finite."""
     found, valid = _gradients(way, family, inputs, stress.wrt)
-    bad = sum(int((~g.isfinite()).reshape(len(g), -1).any(1).sum()) for g in found if g.numel())
+    bad = sum(int(_flat(~g.isfinite()).any(1).sum()) for g in found if g.numel())
     if not family.smooth or not family.inside:
         return None, None, bad
     exact_inputs = tuple(x.double() for x in inputs)
@@ -324,19 +340,21 @@ def _judge(stress: Stress, way: Way) -> Way | None:
     return next((w for w in stress.ways if w.ours and way.ours and DOUBLE in w.dtypes), None)
 
 
-def stresses() -> list[Stress]:
-    """All operations."""
-    from . import (
-        stability_cameras,
-        stability_fields,
-        stability_rotations,
-        stability_skinning,
-        stability_surface,
-        stability_volume,
-    )
+ROOMS = {
+    "rotations": "Rotations and affine maps",
+    "skinning": "Kinematics, skinning, bodies",
+    "surface": "Surfaces",
+    "cameras": "Cameras and rays",
+    "fields": "Encodings, networks, grids",
+    "volume": "Compositing and parts",
+}
+"""Groups of operations, each a module ``stability_NAME`` and a heat map."""
 
-    rooms = (stability_rotations, stability_skinning, stability_surface, stability_cameras)
-    return [s for room in (*rooms, stability_fields, stability_volume) for s in room.stresses()]
+
+def stresses() -> dict[str, list[Stress]]:
+    """All operations, by room."""
+    names = {room: f"{__package__}.stability_{room}" for room in ROOMS}
+    return {room: importlib.import_module(name).stresses() for room, name in names.items()}
 
 
 def run(
@@ -369,8 +387,10 @@ def run(
 
 def _cells(stress: Stress, way: Way, factor: float) -> Iterator[Cell]:
     cases = max(8, round(stress.cases * factor))
-    for family in stress.families:
+    for family in filter(way.serves, stress.families):
         for dtype in way.dtypes:
+            if dtype in HALVES and not family.halves:
+                continue
             yield measure(stress, family, way, dtype, cases)
 
 
@@ -387,14 +407,16 @@ def write_json(outcome: Outcome, path: Path) -> None:
     path.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def chosen(names: Sequence[str]) -> list[Stress]:
-    """The operations of the given names, all where none is given.
+def chosen(names: Sequence[str]) -> dict[str, list[Stress]]:
+    """The operations of the given names, all where none is given, by room.
 
     Raises:
         InputError: an unknown name.
     """
-    every = {s.name: s for s in stresses()}
+    rooms = stresses()
+    every = [s.name for own in rooms.values() for s in own]
     for name in names:
         if name not in every:
             raise InputError(f"--only: expected one of {', '.join(every)}, found {name!r}")
-    return [every[n] for n in names] if names else list(every.values())
+    kept = {r: [s for s in own if not names or s.name in names] for r, own in rooms.items()}
+    return {room: own for room, own in kept.items() if own}

@@ -129,7 +129,6 @@ def _kinematics() -> Stress:
         exact=exact_chain,
         scale=_chain_scale,
         wrt=(0, 1),
-        limit=3e-6,
     )
 
 
@@ -432,7 +431,8 @@ def _inverse() -> Stress:
         ways=tuple(_unskin_way(m) for m in ("newton", "broyden", "fixed_point", "surface")),
         exact=_cycle,
         cases=128,
-        limit=1.1e-3,
+        limit=1e-3,
+        double=1e-3,
     )
 
 
