@@ -13,7 +13,7 @@ from monopart.geometry.distortion import distort_extended
 from monopart.geometry.rotations import axis_angle_to_rotmat
 
 from .registry import load
-from .stability import DOUBLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, Family, Inputs, Stress, Way
 from .stability_rotations import Make, axes
 
 LENSES = {

@@ -16,7 +16,7 @@ from monopart.fields.mlp import PartMLP
 from monopart.fields.occupancy import PartOccupancy
 from monopart.fields.residual import ResidualField
 
-from .stability import DOUBLE, HALVES, SINGLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, HALVES, SINGLE, Family, Inputs, Stress, Way
 from .stability_meshes import ball
 from .stability_rotations import Make
 

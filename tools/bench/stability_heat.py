@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from .stability import Cell, Stress
+from .stability_cases import Cell, Stress
 
 _LABEL, _CELL, _ROW, _HEAD, _TITLE, _LEGEND = 190, 34, 20, 118, 30, 52
 _STYLE = (

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .stability import DOUBLE, Inputs
+from .stability_cases import DOUBLE, Inputs
 from .stability_rotations import Make, axes
 
 # --- the oracle: every face, in float64, from an orthogonal basis of its plane -----------------

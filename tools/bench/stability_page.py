@@ -10,7 +10,8 @@ import torch
 
 from monopart.geometry.errors import InputError
 
-from .stability import ROOMS, Cell, Outcome, Stress, chosen, run, write_json
+from .stability import ROOMS, chosen, run, write_json
+from .stability_cases import Cell, Outcome, Stress
 from .stability_heat import heat_map
 
 Rooms = Mapping[str, Sequence[Stress]]

@@ -1,5 +1,6 @@
 """Stress of closest surface, normals, UV look-up, consistency and culling."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from monopart.geometry.surface import SurfaceIndex, vertex_normals
 from monopart.geometry.uv import UVMap
 
 from .registry import load, load_open3d
-from .stability import DOUBLE, SINGLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
 from .stability_meshes import Mesh, at, ball, box, diagonals, exact_distance, near, scene, soup
 from .stability_rotations import Make, axes
 

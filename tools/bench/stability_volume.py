@@ -13,7 +13,7 @@ from monopart.fields.occupancy import visible_samples
 from monopart.fields.part_union import union_by_density
 from monopart.fields.volume import composite
 
-from .stability import DOUBLE, SINGLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
 from .stability_rotations import Make
 
 _HUGE = 2.0**126  # an infinite density, as a number that can be compared
@@ -203,8 +203,8 @@ def _visible() -> Stress:
         return np.where((before < 10.0) == (seen > 0), 0.0, np.abs(before - 10.0))
 
     families = [
-        Family(f"{s} samples of {size:g}", _wall(_Rays(s), size), extra=_Rays(s))
-        for s, size in ((64, 1.0), (4096, 1e-2), (4096, 1e3), (64, 0.0))
+        Family(f"{s} samples of {size:g}", _wall(_Rays(s, 2), size), extra=_Rays(s, 2))
+        for s, size in ((64, 1.0), (1024, 0.05), (1024, 1e3), (64, 0.0))
     ]
     return Stress(
         name="visible_samples",
