@@ -1,14 +1,12 @@
 """Stress of affine maps: inverses and points."""
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from monopart.geometry.rigid import invert_affine, transform_points
 
-from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, Family, Inputs, Stress, Way
 from .stability_rotations import Make, matrices
 
 
@@ -34,10 +32,6 @@ def _singular(generator: torch.Generator, count: int) -> Inputs:
     return (maps,)
 
 
-def _invert_way(function: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
-    return lambda extra, maps: function(maps)[:, :3]
-
-
 def exact_inverse(extra: None, maps: np.ndarray) -> np.ndarray:
     """The upper rows of the inverses by LAPACK, with one step of refinement."""
     maps = np.where(np.isfinite(maps).all((1, 2))[:, None, None], maps, np.eye(4))
@@ -54,8 +48,10 @@ def _inverse() -> Stress:
         Family("singular", _singular),
         Family("NaN", lambda g, n: (torch.full((n, 4, 4), torch.nan, dtype=DOUBLE),)),
     )
-    kornia = Way(
-        "torch.linalg.inv", _invert_way(torch.linalg.inv), dtypes=(SINGLE, DOUBLE), modules=()
+    lapack = Way(
+        "torch.linalg.inv",
+        lambda extra, maps: torch.linalg.inv(maps)[:, :3],
+        serves=lambda family: family.name != "NaN",
     )
     return Stress(
         name="invert_affine",
@@ -65,7 +61,7 @@ def _inverse() -> Stress:
         families=families,
         ways=(
             Way("monopart", lambda extra, m: _masked(invert_affine(m)), True),
-            kornia,
+            lapack,
         ),
         exact=exact_inverse,
         scale=_inverse_scale,

@@ -23,7 +23,7 @@ STEPS = (
     (1e2, "#d9ef8b", "≤ 100"),
     (1e4, "#fee08b", "≤ 1e4"),
     (1e6, "#fc8d59", "≤ 1e6"),
-    (math.inf, "#d73027", "more: no digits in float32"),
+    (math.inf, "#d73027", "more"),
 )
 
 
@@ -76,7 +76,7 @@ def _block(stress: Stress, cells: Sequence[Cell], top: float) -> tuple[str, floa
     at = {(c.way, c.dtype, c.family): c for c in cells}
     parts = [f'<text class="title" x="10" y="{top + 18:.1f}">{html.escape(stress.title)}</text>']
     for i, family in enumerate(stress.families):
-        x, y = _LABEL + i * _CELL + 8, top + _HEAD - 6
+        x, y = _LABEL + i * _CELL + 15, top + _HEAD - 6
         name = html.escape(family.name if family.inside else f"({family.name})")
         turn = f'transform="rotate(-50 {x} {y:.1f})"'
         parts.append(f'<text class="small" x="{x}" y="{y:.1f}" {turn}>{name}</text>')
@@ -99,7 +99,7 @@ def _legend(y: float) -> str:
     for look, text in looks:
         parts.append(_box(x, y, 14, look))
         parts.append(f'<text class="small" x="{x + 19:.1f}" y="{y + 13:.1f}">{text}</text>')
-        x += 34 + 6.6 * len(text)
+        x += 38 + 6.0 * len(text)
     note = "Left half: values. Right half: gradients of float32 and shorter. (In brackets, pale): "
     note += "outside the stated domain."
     parts.append(f'<text class="small" x="10" y="{y + 36:.1f}">{note}</text>')

@@ -32,6 +32,10 @@ def _largest(cells: Iterable[Cell], of: str) -> tuple[float, Cell] | None:
     return max(known, key=lambda pair: pair[0]) if known else None
 
 
+def _line(entries: Sequence[str]) -> str:
+    return "| " + " | ".join(e.replace("|", "\\|") for e in entries) + " |"
+
+
 def _row(title: str, cells: Sequence[Cell]) -> str:
     """One implementation in one precision, over all families inside the domain."""
     value, slope = _largest(cells, "value"), _largest(cells, "gradient")
@@ -49,11 +53,11 @@ def _row(title: str, cells: Sequence[Cell]) -> str:
     ]
     if stopped:
         entries[-1] += f"; an error in {stopped}"
-    return "| " + " | ".join(entries) + " |"
+    return _line(entries)
 
 
 def _table(which: Sequence[Stress], cells: Sequence[Cell]) -> list[str]:
-    out = ["| " + " | ".join(_HEAD) + " |", "|" + "---|" * len(_HEAD)]
+    out = [_line(_HEAD), "|" + "---|" * len(_HEAD)]
     for stress in which:
         own = [c for c in cells if c.operation == stress.name and c.inside]
         title = f"**{stress.title}**"
@@ -65,7 +69,7 @@ def _table(which: Sequence[Stress], cells: Sequence[Cell]) -> list[str]:
 
 def _domains(which: Sequence[Stress]) -> list[str]:
     out = ["| operation | holds for; else | errors relative to |", "|---|---|---|"]
-    out += [f"| {s.title} | {s.domain} | {s.error} |" for s in which]
+    out += [_line((s.title, s.domain, s.error)) for s in which]
     return [*out, ""]
 
 

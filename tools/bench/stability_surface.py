@@ -22,7 +22,7 @@ from .stability_rotations import Make, axes
 def _surface_families() -> tuple[Family, ...]:
     whole, cube = ball(), box()
     out = [
-        Family("3 cm off", near(whole, 0.03), extra=whole.faces, smooth=False),
+        Family("3 cm off", near(whole, 0.03), extra=whole.faces, step=1e-8, slope=1e-3),
         Family("1 µm off", near(whole, 1e-6), extra=whole.faces, smooth=False),
         Family("on faces", near(whole, 0.0), extra=whole.faces, smooth=False),
         Family("on edges", near(whole, 0.0, "edge"), extra=whole.faces, smooth=False),
@@ -49,7 +49,16 @@ def _surface_families() -> tuple[Family, ...]:
         ("100 km away", 1.0, 1e5),
     ):
         mesh = ball(size, away)
-        out.append(Family(name, near(mesh, 0.03 * size), extra=mesh.faces, smooth=False))
+        out.append(
+            Family(
+                name,
+                near(mesh, 0.03 * size),
+                extra=mesh.faces,
+                step=1e-8 * size,
+                smooth=not away,
+                slope=1e-3,
+            )
+        )
     for gap in (1e3, 1e6):
         out.append(
             Family(
@@ -103,11 +112,16 @@ def _igl(faces: Tensor, points: Tensor, verts: Tensor) -> Tensor:
     return torch.from_numpy(np.sqrt(np.asarray(found).reshape(-1)))
 
 
+def _finite(family: Family) -> bool:
+    """Peers have no mask to say that a point that is not finite has no answer."""
+    return family.name not in ("infinite", "NaN")
+
+
 def _surface() -> Stress:
     peers = (
-        Way("Open3D", _open3d, False, (SINGLE,), ("open3d",), False),
-        Way("libigl", _igl, False, (DOUBLE,), ("igl",), False),
-        Way("trimesh", _trimesh, False, (DOUBLE,), ("trimesh", "rtree"), False),
+        Way("Open3D", _open3d, False, (SINGLE,), ("open3d",), False, _finite),
+        Way("libigl", _igl, False, (DOUBLE,), ("igl",), False, _finite),
+        Way("trimesh", _trimesh, False, (DOUBLE,), ("trimesh", "rtree"), False, _finite),
     )
     ours = (_surface_way("torch"), _surface_way("warp"), _foot_way("torch"), _foot_way("warp"))
     return Stress(
