@@ -114,7 +114,7 @@ def heat_map(which: Sequence[Stress], cells: Sequence[Cell], title: str) -> str:
         cells: all cells of a run.
         title: for readers that cannot see it.
     """
-    parts, top, widest = [_legend(10)], float(_LEGEND + 12), 0
+    parts, top, widest = [_legend(10.0)], float(_LEGEND + 12), 0
     for stress in which:
         own = [c for c in cells if c.operation == stress.name]
         if own:
