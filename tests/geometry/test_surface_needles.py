@@ -38,7 +38,7 @@ def test_gradients_of_needles() -> None:
     slopes = []
     for dtype in (torch.float32, torch.float64):
         leaves = [x.float().to(dtype).requires_grad_() for x in (points, verts)]
-        hit = closest_point(*leaves, mesh.faces, backend="torch")
+        hit = closest_point(leaves[0], leaves[1], mesh.faces, backend="torch")
         slopes.append(torch.autograd.grad(hit.distance.sum(), leaves))
     for single, double in zip(*slopes, strict=True):
         assert single.isfinite().all()

@@ -136,7 +136,7 @@ def test_the_command_writes_tables_maps_and_json(tmp_path: Path) -> None:
     arguments = ["stability", "--quick", *only, "--out", str(tmp_path / "out")]
     assert main([*arguments, "--into", str(page)]) is None
     text = page.read_text()
-    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert text.startswith("before\n") and text.endswith("after\n") and "\nold\n" not in text
     assert "quaternion to matrix" in text and "\\|det\\|" in text
     data = json.loads((tmp_path / "out" / "stability.json").read_text())
     assert data["schema"] == 1 and data["cases"] == sum(c["cases"] for c in data["cells"])

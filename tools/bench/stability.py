@@ -143,6 +143,8 @@ def measure(stress: Stress, family: Family, way: Way, dtype: torch.dtype, cases:
         dtype: the precision.
         cases: how many inputs are wanted.
     """
+    if family.large:
+        family = dataclasses.replace(family, extra=family.extra())
     generator = torch.Generator().manual_seed(zlib.crc32(family.name.encode()))
     # rounded to the precision first: the oracle and float64 see the same numbers
     inputs = tuple(x.to(dtype) for x in family.make(generator, min(cases, family.cases or cases)))
@@ -218,6 +220,7 @@ def run(
     which: Sequence[Stress],
     factor: float = 1.0,
     peers: bool = True,
+    large: bool = False,
     say: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
 ) -> Outcome:
     """Run operations on all their families.
@@ -226,6 +229,7 @@ def run(
         which: the operations.
         factor: of the number of cases.
         peers: run other libraries too.
+        large: run families that take long too.
         say: told of the progress.
     """
     outcome = Outcome()
@@ -238,15 +242,15 @@ def run(
                 if missing is not None:
                     outcome.absent[way.name] = missing
                 elif way.ours or peers:
-                    outcome.cells += _cells(stress, way, factor)
+                    outcome.cells += _cells(stress, way, factor, large)
     return outcome
 
 
-def _cells(stress: Stress, way: Way, factor: float) -> Iterator[Cell]:
+def _cells(stress: Stress, way: Way, factor: float, large: bool) -> Iterator[Cell]:
     cases = max(8, round(stress.cases * factor))
     for family in filter(way.serves, stress.families):
         for dtype in way.dtypes:
-            if dtype in HALVES and not family.halves:
+            if (dtype in HALVES and not family.halves) or (family.large and not large):
                 continue
             yield measure(stress, family, way, dtype, cases)
 

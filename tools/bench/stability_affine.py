@@ -34,7 +34,7 @@ def _singular(generator: torch.Generator, count: int) -> Inputs:
 
 def exact_inverse(extra: None, maps: np.ndarray) -> np.ndarray:
     """The upper rows of the inverses by LAPACK, with one step of refinement."""
-    maps = np.where(np.isfinite(maps).all((1, 2))[:, None, None], maps, np.eye(4))
+    maps = np.where(np.isfinite(maps).all((1, 2), keepdims=True), maps, np.eye(4))
     singular = np.abs(np.linalg.det(maps[:, :3, :3])) < 1e-9
     found = np.linalg.inv(np.where(singular[:, None, None], np.eye(4), maps))
     return (found @ (2 * np.eye(4) - maps @ found))[:, :3]

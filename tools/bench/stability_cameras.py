@@ -40,7 +40,7 @@ def camera(
     R = axis_angle_to_rotmat(torch.tensor([0.3, -0.7, 0.2]))
     t = torch.tensor([0.1, -0.2, 0.5]) - R @ torch.full((3,), away)
     coefficients = torch.tensor(LENSES[lens])
-    return Camera(*(x.double() for x in (K, R, t)), (512, 512), coefficients.double())
+    return Camera(K.double(), R.double(), t.double(), (512, 512), coefficients.double())
 
 
 def _ahead(camera: Camera, depth: tuple[float, float], spread: float) -> Make:

@@ -32,6 +32,8 @@ class Family:
     """What is not a float: faces, a tree, a camera."""
     cases: int | None = None
     """Largest number of cases."""
+    large: bool = False
+    """Only in exhaustive runs; ``extra`` is a function that makes it then."""
     halves: bool = True
     """Inside the range of float16 too."""
     slope: float = 1e-4

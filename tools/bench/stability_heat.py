@@ -31,7 +31,7 @@ def _colour(ulps: float) -> str:
     return next(colour for end, colour, _ in STEPS if ulps <= end)
 
 
-def _box(x: float, y: float, width: float, look: str) -> str:
+def _box(x: float | int, y: float | int, width: float | int, look: str) -> str:
     return f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{_ROW - 3}" {look}/>'
 
 
@@ -60,7 +60,7 @@ def _told(cell: Cell) -> str:
     return f"{text}{cell.bad_gradients} gradients" + (f"; {cell.raised}" if cell.raised else "")
 
 
-def _cell(cell: Cell, x: float, y: float) -> str:
+def _cell(cell: Cell, x: float | int, y: float | int) -> str:
     half = (_CELL - 4) / 2
     parts = [_box(x, y, half, _value_look(cell)), _box(x + half + 1, y, half, _slope_look(cell))]
     for bad, middle in ((cell.bad_values, x + half / 2), (cell.bad_gradients, x + 1.5 * half + 1)):

@@ -1,6 +1,7 @@
 """Meshes with defects, points around them, and the float64 oracle of the distance to them."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -89,6 +90,12 @@ def ball(size: float = 1.0, away: float = 0.0, rings: int = 12) -> Mesh:
             a, b = r * across + s, r * across + n
             faces += [(a, a + across, b), (b, a + across, b + across)]
     return Mesh(verts * size + away, torch.tensor(faces))
+
+
+@functools.cache
+def huge() -> Mesh:
+    """A ball of a million triangles."""
+    return ball(rings=501)
 
 
 def soup(kind: str) -> Mesh:

@@ -16,7 +16,7 @@ from .stability_heat import heat_map
 
 Rooms = Mapping[str, Sequence[Stress]]
 BEGIN, END = "<!-- stability: begin -->", "<!-- stability: end -->"
-FACTORS = {"quick": 0.1, "usual": 1.0, "exhaustive": 12.0}
+FACTORS = {"quick": 0.1, "usual": 1.0, "exhaustive": 7.0}
 """Cases of a family, in those of a usual run."""
 PROMISED = {"blend_skin", "body", "project", "rays", "undistort", "closest_point"}
 """Operations that are promised to 1e-6 in float32."""
@@ -227,7 +227,7 @@ def command(size: str, only: Sequence[str], out: Path, page: Path | None) -> Non
     """
     rooms = chosen(only)
     which = [s for own in rooms.values() for s in own]
-    outcome = run(which, FACTORS[size], peers=size != "quick")
+    outcome = run(which, FACTORS[size], size != "quick", size == "exhaustive")
     write(rooms, outcome, out)
     if page is not None:
         publish(rooms, outcome, page)

@@ -15,8 +15,23 @@ from monopart.geometry.uv import UVMap
 
 from .registry import load, load_open3d
 from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
-from .stability_meshes import Mesh, at, ball, box, diagonals, exact_distance, near, scene, soup
+from .stability_meshes import (
+    Mesh,
+    at,
+    ball,
+    box,
+    diagonals,
+    exact_distance,
+    huge,
+    near,
+    scene,
+    soup,
+)
 from .stability_rotations import Make, axes
+
+
+def _near_huge(generator: torch.Generator, count: int) -> Inputs:
+    return near(huge(), 0.03)(generator, count)
 
 
 def _surface_families() -> tuple[Family, ...]:
@@ -68,7 +83,15 @@ def _surface_families() -> tuple[Family, ...]:
     for name, value in (("infinite", torch.inf), ("NaN", torch.nan)):
         place = at(whole, lambda g, n, v=value: torch.full((n, 3), v, dtype=DOUBLE))
         out.append(Family(name, place, extra=whole.faces, smooth=False))
-    return tuple(out)
+    million = Family(
+        "1e6 triangles",
+        _near_huge,
+        extra=lambda: huge().faces,
+        smooth=False,
+        cases=4,
+        large=True,
+    )
+    return (*out, million)
 
 
 def _surface_way(backend: str) -> Way:
