@@ -117,11 +117,19 @@ def _gradient_error(found: list[Tensor], true: list[Tensor]) -> float | None:
 
 
 def _value_errors(
-    stress: Stress, family: Family, inputs: Inputs, result: Tensor, valid: Tensor
+    stress: Stress,
+    family: Family,
+    inputs: Inputs,
+    result: Tensor,
+    valid: Tensor,
+    known: dict[tuple[str, torch.dtype], np.ndarray],
 ) -> tuple[float | None, float | None, int, np.ndarray]:
     """Relative and absolute error, rows that are not finite, and the scale of each row."""
     arrays = [x.detach().double().numpy() for x in inputs]
-    exact = np.asarray(stress.exact(family.extra, *arrays), np.float64)
+    key = (family.name, inputs[0].dtype)  # the inputs are the same for every implementation
+    if key not in known:
+        known[key] = np.asarray(stress.exact(family.extra, *arrays), np.float64)
+    exact = known[key]
     found = result.detach().double().numpy()
     keep = valid.numpy()
     sound = np.isfinite(_as_rows(found)).all(1)
@@ -133,7 +141,14 @@ def _value_errors(
     return _worst(relative), _worst(gap), int((keep & ~sound).sum()), size
 
 
-def measure(stress: Stress, family: Family, way: Way, dtype: torch.dtype, cases: int) -> Cell:
+def measure(
+    stress: Stress,
+    family: Family,
+    way: Way,
+    dtype: torch.dtype,
+    cases: int,
+    known: dict[tuple[str, torch.dtype], np.ndarray],
+) -> Cell:
     """Run one implementation on one family in one precision.
 
     Args:
@@ -142,6 +157,7 @@ def measure(stress: Stress, family: Family, way: Way, dtype: torch.dtype, cases:
         way: the implementation.
         dtype: the precision.
         cases: how many inputs are wanted.
+        known: exact results of this operation, kept from one implementation to the next.
     """
     if family.large:
         family = dataclasses.replace(family, extra=family.extra())
@@ -152,7 +168,7 @@ def measure(stress: Stress, family: Family, way: Way, dtype: torch.dtype, cases:
     try:
         with torch.no_grad():
             result, valid = _apply(way, family, inputs)
-        relative, gap, bad, size = _value_errors(stress, family, inputs, result, valid)
+        relative, gap, bad, size = _value_errors(stress, family, inputs, result, valid, known)
         slope, gain, bad_slopes = None, None, 0
         if way.differentiable and stress.wrt and len(result):
             slope, gain, bad_slopes = _slopes(stress, family, way, inputs, size)
@@ -237,22 +253,29 @@ def run(
         warnings.simplefilter("ignore")  # peers warn of what is measured here
         for stress in which:
             say(f"{stress.name}: {stress.title}")
+            known: dict[tuple[str, torch.dtype], np.ndarray] = {}
             for way in stress.ways:
                 missing = way.absent()
                 if missing is not None:
                     outcome.absent[way.name] = missing
                 elif way.ours or peers:
-                    outcome.cells += _cells(stress, way, factor, large)
+                    outcome.cells += _cells(stress, way, factor, large, known)
     return outcome
 
 
-def _cells(stress: Stress, way: Way, factor: float, large: bool) -> Iterator[Cell]:
+def _cells(
+    stress: Stress,
+    way: Way,
+    factor: float,
+    large: bool,
+    known: dict[tuple[str, torch.dtype], np.ndarray],
+) -> Iterator[Cell]:
     cases = max(8, round(stress.cases * factor))
     for family in filter(way.serves, stress.families):
         for dtype in way.dtypes:
             if (dtype in HALVES and not family.halves) or (family.large and not large):
                 continue
-            yield measure(stress, family, way, dtype, cases)
+            yield measure(stress, family, way, dtype, cases, known)
 
 
 def write_json(outcome: Outcome, path: Path) -> None:

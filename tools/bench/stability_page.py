@@ -198,7 +198,7 @@ def _broken(stress: Stress, cell: Cell) -> list[str]:
     way = next(w for w in stress.ways if w.name == cell.way)
     family = next(f for f in stress.families if f.name == cell.family)
     values = {"float32": way.limit or stress.limit, "float64": way.double or stress.double}
-    slopes = {"float32": family.slope, "float64": max(1e-4, family.slope / 10)}
+    slopes = {"float32": family.slope, "float64": min(1e-2, max(1e-4, family.slope / 10))}
     checks = (
         ("values not finite", cell.bad_values, 0.0),
         ("gradients not finite", cell.bad_gradients, 0.0),
