@@ -279,7 +279,7 @@ def _from_quat() -> Stress:
             _kornia("quaternion_to_rotation_matrix"),
             dataclasses.replace(
                 _roma("unitquat_to_rotmat", first=True),
-                serves=lambda f: f.name in ("length 1", "near-opposite"),  # as it asks for
+                serves=lambda f: f.name == "length 1",  # as it asks for
             ),
         ),
         exact=exact_of_quat,

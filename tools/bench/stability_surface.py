@@ -73,7 +73,7 @@ def _surface_families() -> tuple[Family, ...]:
                 extra=mesh.faces,
                 step=1e-8 * size,
                 smooth=not away,
-                slope=1e-3,
+                slope=2e-2,
             )
         )
     for gap in (1e3, 1e6):
