@@ -58,10 +58,13 @@ class PartOccupancy(torch.nn.Module):
             part: part of each point.
 
         Returns:
-            Indices into ``peak`` and ``floor``; points outside belong to the nearest border cell.
+            Indices into ``peak`` and ``floor``; points outside, however far, belong to the nearest
+            border cell. One that is NaN is given some cell.
         """
         place = (points - self.lo[part]) * (self.cells / self.edge)[part, None]
-        x, y, z = place.long().clamp_(0, self.cells - 1).unbind(-1)
+        # clamped as floats, which a whole number may not hold, and again for NaN
+        place = place.clamp_(-1, self.cells).long().clamp_(0, self.cells - 1)
+        x, y, z = place.unbind(-1)
         return ((part * self.cells + z) * self.cells + y) * self.cells + x
 
     def keep(self, cell: Int[Tensor, "n"], density: float) -> Bool[Tensor, "n"]:

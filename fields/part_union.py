@@ -41,7 +41,7 @@ def union_by_density(
         num_parts: number of parts.
 
     Returns:
-        The union, differentiable in sigma.
+        The union, differentiable in sigma; NaN where a density of the sample is NaN.
 
     >>> s = torch.tensor([1.0, 5.0, 3.0])
     >>> out = union_by_density(s, torch.tensor([0, 1, 0]), torch.tensor([0, 0, 1]), 3, 2)
@@ -54,7 +54,7 @@ def union_by_density(
         table[part, sample] = sigma
         best, value = sample.new_zeros(num_samples), table[0]
         for k in range(1, num_parts):  # K passes beat argmax over a short leading axis
-            better = table[k] > value  # the first of equals stays
+            better = ~(table[k] <= value) & ~value.isnan()  # the first of equals; NaN is kept
             best = torch.where(better, k, best)
             value = torch.where(better, table[k], value)
         won = best[sample] == part

@@ -114,17 +114,28 @@ def quat_wxyz_to_rotmat(quat: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
     """Rotation matrices of quaternions (w first), which need not have unit length.
 
     Args:
-        quat: quaternions, (*b, 4); a zero quaternion gives the identity.
+        quat: quaternions, (*b, 4), of any finite length; a zero quaternion gives the identity.
 
     Returns:
-        Rotation matrices, (*b, 3, 3); differentiable.
+        Rotation matrices, (*b, 3, 3); differentiable; NaN where the quaternion is not finite. The
+        gradient is as large as one over the length, and leaves float32 below a length of 1e-37.
 
     >>> quat_wxyz_to_rotmat(torch.tensor([2.0, 0.0, 0.0, 0.0])).diagonal().tolist()
     [1.0, 1.0, 1.0]
     """
-    from kornia.geometry.conversions import quaternion_to_rotation_matrix
-
-    return quaternion_to_rotation_matrix(quat)
+    # squares of tiny and of huge components leave the range of floats: scaled to size one first
+    largest = quat.detach().abs().amax(-1, keepdim=True)
+    w, x, y, z = (quat / torch.where(largest > 0, largest, torch.ones_like(largest))).unbind(-1)
+    square = w * w + x * x + y * y + z * z
+    s = 2 / torch.where(square > 0, square, torch.ones_like(square))
+    s = torch.where(square.isnan(), square, s)
+    sx, sy, sz = s * x, s * y, s * z
+    rows = (
+        *(1 - (sy * y + sz * z), sx * y - sz * w, sx * z + sy * w),
+        *(sx * y + sz * w, 1 - (sx * x + sz * z), sy * z - sx * w),
+        *(sx * z - sy * w, sy * z + sx * w, 1 - (sx * x + sy * y)),
+    )
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
 def rotmat_to_axis_angle(rotmat: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:

@@ -68,18 +68,21 @@ def closest_on_triangle(
     a, b, c = triangles.unbind(-2)
     ab, ac, ap = b - a, c - a, points - a
     bc, bp = c - b, points - b
-    # Inside test by the Gram matrix of the edges.
-    d00, d01, d11 = (ab * ab).sum(-1), (ab * ac).sum(-1), (ac * ac).sum(-1)
-    d20, d21 = (ap * ab).sum(-1), (ap * ac).sum(-1)
-    det = d00 * d11 - d01 * d01
-    flat = det <= 4.0 * torch.finfo(det.dtype).eps * d00 * d11
-    safe_det = torch.where(flat, torch.ones_like(det), det)
-    v = (d11 * d20 - d01 * d21) / safe_det
-    w = (d00 * d21 - d01 * d20) / safe_det
+    # An orthogonal basis of the plane: determinants of a needle would cancel to nothing.
+    d00, d11 = (ab * ab).sum(-1), (ac * ac).sum(-1)
+    long = d00 > torch.finfo(d00.dtype).tiny
+    over = torch.where(long, 1.0, 0.0) / torch.where(long, d00, 1.0)
+    lean, along = (ab * ac).sum(-1) * over, (ab * ap).sum(-1) * over
+    height = ac - lean[..., None] * ab
+    square = (height * height).sum(-1)
+    flat = ~(square > (8 * torch.finfo(d11.dtype).eps) ** 2 * d11) | ~long
+    across = (height * (ap - along[..., None] * ab)).sum(-1)
+    w = across / torch.where(flat, torch.ones_like(square), square)
+    v = along - w * lean
     inside = (v >= 0) & (w >= 0) & (v + w <= 1) & ~flat
     face_bary = torch.stack([1 - v - w, v, w], -1)
     # Nearest point of each edge.
-    s_ab, s_ac = _ratio(d20, d00), _ratio(d21, d11)
+    s_ab, s_ac = _ratio((ab * ap).sum(-1), d00), _ratio((ac * ap).sum(-1), d11)
     s_bc = _ratio((bp * bc).sum(-1), (bc * bc).sum(-1))
     zero = torch.zeros_like(v)
     edges = torch.stack(
@@ -116,9 +119,11 @@ def _check_like(points: Tensor, verts: Tensor) -> None:
 
 def _hit(points: Tensor, verts: Tensor, faces: Tensor, face: Tensor, limit: float) -> SurfaceHit:
     """Evaluate barycentrics, point and distance on known faces (-1: none), differentiably."""
-    found = face >= 0
+    found = (face >= 0) & points.isfinite().all(-1)
     face = face.clamp(min=0).long()
     triangles = verts[faces[face]]
+    # a point that is not finite would turn the gradients of all vertices into NaN
+    points = torch.where(found[:, None], points, triangles.detach()[:, 0])
     bary = closest_on_triangle(points, triangles)
     point = (bary[..., None] * triangles).sum(-2)
     distance = safe_norm(points - point)
@@ -314,7 +319,15 @@ def vertex_normals(
     for corner in range(3):
         total = total.index_add(-2, faces[:, corner], cross)
     length = safe_norm(total)[..., None]
-    return torch.where(length > 0, total / torch.where(length > 0, length, 1.0), 0.0)
+    # what is left of faces without area, or of faces that cancel, is rounding: it has no direction
+    with torch.no_grad():
+        sides = corners[..., 1:, :] - corners[..., :1, :]
+        bound = sides.norm(dim=-1).prod(-1)[..., None]
+        noise = torch.zeros_like(total[..., :1])
+        for corner in range(3):
+            noise = noise.index_add(-2, faces[:, corner], bound)
+        sound = length > 4 * torch.finfo(total.dtype).eps * noise
+    return torch.where(sound, total / torch.where(sound, length, 1.0), 0.0)
 
 
 def signed_distance(

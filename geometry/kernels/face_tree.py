@@ -4,7 +4,6 @@ The search is C++ inside a Warp function: its loops over 8 lanes become vector i
 CPU, and the same text compiles for CUDA. Layout of the arrays: see `monopart.geometry.face_tree`.
 """
 
-# ruff: noqa: PLR0911 - one return per region of a triangle
 # pyright: reportInvalidTypeForm=false
 
 from typing import Any, no_type_check
@@ -21,7 +20,8 @@ LAYOUT = 6  # numbers that describe the tree of one group
 _FAR = wp.constant(FAR)
 
 # Squared distances d[8] of a point p to the faces of a leaf t: the plane where its foot is inside,
-# else the nearest of three edges; faces without area have edges only.
+# else the nearest of three edges; faces without area have edges only. The plane's basis is made
+# orthogonal (b, and h = c - g b): determinants of a needle would cancel to nothing.
 _LEAF = """
     for (int k = 0; k < 8; k++) {
         const float px = p[0] - t[k], py = p[1] - t[8 + k], pz = p[2] - t[16 + k];
@@ -29,32 +29,33 @@ _LEAF = """
         const float cx = t[48 + k], cy = t[56 + k], cz = t[64 + k];
         const float bb = bx * bx + by * by + bz * bz;
         const float cc = cx * cx + cy * cy + cz * cz;
-        const float bc = bx * cx + by * cy + bz * cz;
-        const float pb = bx * px + by * py + bz * pz;
-        const float pc = cx * px + cy * py + cz * pz;
-        const float det = bb * cc - bc * bc;
-        const float scale = 1.0f / (det > 1e-30f ? det : 1e-30f);
-        const float v = (cc * pb - bc * pc) * scale, w = (bb * pc - bc * pb) * scale;
-        float s = pb / (bb > 1e-30f ? bb : 1e-30f);
-        float u = pc / (cc > 1e-30f ? cc : 1e-30f);
-        const float ll = bb + cc - 2.0f * bc;
-        float q = ((pc - pb) + (bb - bc)) / (ll > 1e-30f ? ll : 1e-30f);
+        const float over_bb = 1.0f / (bb > 1e-30f ? bb : 1e-30f);
+        const float g = (bx * cx + by * cy + bz * cz) * over_bb;
+        float s = (bx * px + by * py + bz * pz) * over_bb;
+        float u = (cx * px + cy * py + cz * pz) / (cc > 1e-30f ? cc : 1e-30f);
+        const float hx = cx - g * bx, hy = cy - g * by, hz = cz - g * bz;
+        float x = px - s * bx, y = py - s * by, z = pz - s * bz;
+        const float hh = hx * hx + hy * hy + hz * hz;
+        const float w = (hx * x + hy * y + hz * z) / (hh > 1e-30f ? hh : 1e-30f);
+        const float v = s - w * g;
+        x -= w * hx; y -= w * hy; z -= w * hz;
+        const float inside = x * x + y * y + z * z;
+        const float ex = cx - bx, ey = cy - by, ez = cz - bz;
+        const float qx = px - bx, qy = py - by, qz = pz - bz;
+        const float ee = ex * ex + ey * ey + ez * ez;
+        float q = (ex * qx + ey * qy + ez * qz) / (ee > 1e-30f ? ee : 1e-30f);
         s = s < 0.0f ? 0.0f : (s > 1.0f ? 1.0f : s);
         u = u < 0.0f ? 0.0f : (u > 1.0f ? 1.0f : u);
         q = q < 0.0f ? 0.0f : (q > 1.0f ? 1.0f : q);
-        const float r = 1.0f - q;
-        float x = px - s * bx, y = py - s * by, z = pz - s * bz;
+        x = px - s * bx; y = py - s * by; z = pz - s * bz;
         const float on_b = x * x + y * y + z * z;
         x = px - u * cx; y = py - u * cy; z = pz - u * cz;
         const float on_c = x * x + y * y + z * z;
-        x = px - r * bx - q * cx; y = py - r * by - q * cy; z = pz - r * bz - q * cz;
+        x = qx - q * ex; y = qy - q * ey; z = qz - q * ez;
         const float on_a = x * x + y * y + z * z;
-        x = px - v * bx - w * cx; y = py - v * by - w * cy; z = pz - v * bz - w * cz;
-        const float inside = x * x + y * y + z * z;
         float edge = on_b < on_c ? on_b : on_c;
         edge = edge < on_a ? edge : on_a;
-        const bool is_in = v >= 0.0f && w >= 0.0f && v + w <= 1.0f
-            && det > 1e-12f * bb * cc;
+        const bool is_in = v >= 0.0f && w >= 0.0f && v + w <= 1.0f && hh > 1e-12f * cc;
         d[k] = is_in ? inside : edge;
     }
 """
@@ -159,42 +160,35 @@ closest_in_tree, closest_in_leaf = _search()
 def bary_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
     """Barycentrics of the nearest point of a triangle; exact zeros on edges and corners.
 
-    C. Ericson, Real-Time Collision Detection, 2005, ch. 5.1.5: at most one division.
+    In an orthogonal basis of the plane, as in the search: a needle keeps its digits.
     """
     ab = b - a
     ac = c - a
     ap = p - a
-    d1 = wp.dot(ab, ap)
-    d2 = wp.dot(ac, ap)
-    if d1 <= 0.0 and d2 <= 0.0:
-        return wp.vec3(1.0, 0.0, 0.0)
     d00 = wp.dot(ab, ab)
-    d01 = wp.dot(ab, ac)
     d11 = wp.dot(ac, ac)
-    d3 = d1 - d00
-    d4 = d2 - d01
-    if d3 >= 0.0 and d4 <= d3:
-        return wp.vec3(0.0, 1.0, 0.0)
-    d5 = d1 - d01
-    d6 = d2 - d11
-    if d6 >= 0.0 and d5 <= d6:
-        return wp.vec3(0.0, 0.0, 1.0)
-    vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        t = d1 / wp.max(d00, 1.0e-30)
-        return wp.vec3(1.0 - t, t, 0.0)
-    vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        t = d2 / wp.max(d11, 1.0e-30)
-        return wp.vec3(1.0 - t, 0.0, t)
-    va = d3 * d6 - d5 * d4
-    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        t = (d4 - d3) / wp.max((d4 - d3) + (d5 - d6), 1.0e-30)
-        return wp.vec3(0.0, 1.0 - t, t)
-    scale = 1.0 / wp.max(va + vb + vc, 1.0e-30)
-    v = vb * scale
-    w = vc * scale
-    return wp.vec3(1.0 - v - w, v, w)
+    over = 1.0 / wp.max(d00, 1.0e-30)
+    g = wp.dot(ab, ac) * over
+    s = wp.dot(ab, ap) * over
+    h = ac - g * ab
+    hh = wp.dot(h, h)
+    w = wp.dot(h, ap - s * ab) / wp.max(hh, 1.0e-30)
+    v = s - w * g
+    if v >= 0.0 and w >= 0.0 and v + w <= 1.0 and hh > 1.0e-12 * d11:
+        return wp.vec3(1.0 - v - w, v, w)
+    bc = c - b
+    bp = p - b
+    s = wp.clamp(s, 0.0, 1.0)
+    u = wp.clamp(wp.dot(ac, ap) / wp.max(d11, 1.0e-30), 0.0, 1.0)
+    q = wp.clamp(wp.dot(bc, bp) / wp.max(wp.dot(bc, bc), 1.0e-30), 0.0, 1.0)
+    on_b = wp.length_sq(ap - s * ab)
+    on_c = wp.length_sq(ap - u * ac)
+    on_a = wp.length_sq(bp - q * bc)
+    if on_b <= on_c and on_b <= on_a:
+        return wp.vec3(1.0 - s, s, 0.0)
+    if on_c <= on_a:
+        return wp.vec3(1.0 - u, 0.0, u)
+    return wp.vec3(0.0, 1.0 - q, q)
 
 
 @no_type_check

@@ -1,5 +1,6 @@
 """Learned occupancy against plain loops."""
 
+import pytest
 import torch
 
 from monopart.fields.occupancy import PartOccupancy, visible_samples
@@ -62,3 +63,13 @@ def test_visible_samples_against_a_loop() -> None:
     assert not all(expected), "the case must hide something"
     empty = torch.zeros(0)
     assert visible_samples(empty, torch.zeros(4, dtype=torch.long), empty.int(), 1.0).tolist() == []
+
+
+@pytest.mark.parametrize("far", [10.0, 1e10, 1e20, torch.inf])
+def test_points_however_far_belong_to_the_nearest_cell(far: float) -> None:
+    occupancy = PartOccupancy(torch.zeros(1, 3), torch.ones(1), cells=4)
+    points = torch.tensor([[far, 0.5, -far], [-far, -far, -far], [far, far, far]])
+    cell = occupancy.cells_of(points, torch.zeros(3, dtype=torch.long))
+    assert cell.tolist() == [3 + 4 * (2 + 4 * 0), 0, 63]
+    nan = occupancy.cells_of(torch.full((1, 3), torch.nan), torch.zeros(1, dtype=torch.long))
+    assert 0 <= int(nan) < 64

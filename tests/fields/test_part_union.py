@@ -70,3 +70,13 @@ def test_only_winners_get_a_gradient() -> None:
     assert sigma.grad is not None
     assert torch.equal(sigma.grad, expected)
     assert 0 < len(found.winner) < len(part)
+
+
+@pytest.mark.parametrize("row", [0, 1, 2])
+def test_a_density_that_is_not_a_number_is_not_lost(row: int) -> None:
+    sigma = torch.tensor([1.0, 2.0, 3.0])
+    sigma[row] = torch.nan
+    sample, part = torch.tensor([0, 0, 0]), torch.tensor([0, 2, 3])
+    found = union_by_density(sigma, sample, part, 2, 5)
+    assert found.sigma[0].isnan() and found.sigma[1] == 0
+    assert found.winner.tolist() == [row]

@@ -212,3 +212,31 @@ def test_oracle_itself_against_the_exponential_series() -> None:
         term = term @ cross / n
         total += term
     assert np.abs(oracles.rodrigues(v) - total).max() < 1e-14
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("length", [1e-35, 1e-20, 1e-13, 1.0, 1e20, 1e35])
+def test_quaternions_of_any_length(length: float, dtype: torch.dtype) -> None:
+    unit = torch.tensor([0.5, -0.1, 0.7, 0.3], dtype=dtype)
+    unit = unit / unit.norm()
+    quat = (unit * length).requires_grad_()
+    rotmat = quat_wxyz_to_rotmat(quat)
+    eps = torch.finfo(dtype).eps
+    torch.testing.assert_close(rotmat, quat_wxyz_to_rotmat(unit), atol=8 * eps, rtol=0)
+    torch.testing.assert_close(rotmat @ rotmat.mT, torch.eye(3, dtype=dtype), atol=8 * eps, rtol=0)
+    weights = torch.rand(3, 3, dtype=dtype)
+    (slope,) = torch.autograd.grad((rotmat * weights).sum(), quat)
+    one = unit.clone().requires_grad_()
+    (expected,) = torch.autograd.grad((quat_wxyz_to_rotmat(one) * weights).sum(), one)
+    torch.testing.assert_close(slope * length, expected, atol=64 * eps, rtol=1e-3)
+    assert abs(float((slope * length) @ unit)) < 64 * eps, "a change of length turns nothing"
+
+
+def test_quaternions_without_an_answer() -> None:
+    zero = torch.zeros(4, requires_grad=True)
+    rotmat = quat_wxyz_to_rotmat(zero)
+    assert torch.equal(rotmat, torch.eye(3))
+    (slope,) = torch.autograd.grad(rotmat.sum(), zero)
+    assert torch.equal(slope, torch.zeros(4))
+    for bad in (torch.inf, torch.nan):
+        assert quat_wxyz_to_rotmat(torch.tensor([1.0, bad, 0.0, 0.0])).isnan().any()

@@ -52,6 +52,7 @@ def parser() -> argparse.ArgumentParser:
         command.add_argument("--out", type=Path, default=Path("runs/bench"), metavar="DIR")
         command.add_argument("--threads", type=int, metavar="N", help="threads of torch and Warp")
         command.add_argument("--markdown", action="store_true", help="print Markdown, not a table")
+    _stability_arguments(commands)
     compare = commands.add_parser("compare", help="two reports side by side")
     compare.add_argument("a", type=Path, metavar="A.json")
     compare.add_argument("b", type=Path, metavar="B.json")
@@ -74,6 +75,17 @@ def _training_arguments(command: argparse.ArgumentParser) -> None:
     budget = command.add_mutually_exclusive_group()
     budget.add_argument("--seconds", type=float, default=240.0, metavar="S", help="of the clock")
     budget.add_argument("--cpu-seconds", type=float, metavar="S", help="of the processor")
+
+
+def _stability_arguments(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    text = "every operation on inputs that break float arithmetic, beside other libraries"
+    command = commands.add_parser("stability", help=text, description=text)
+    size = command.add_mutually_exclusive_group()
+    size.add_argument("--exhaustive", action="store_true", help="about a million cases")
+    size.add_argument("--quick", action="store_true", help="ours only, few cases")
+    command.add_argument("--only", action="append", default=[], metavar="OPERATION")
+    command.add_argument("--out", type=Path, default=Path("runs/bench"), metavar="DIR")
+    command.add_argument("--into", type=Path, metavar="PAGE", help="write tables and maps into it")
 
 
 def main(argv: Sequence[str] | None = None) -> int | None:
@@ -103,6 +115,11 @@ def _run(arguments: argparse.Namespace) -> None:
         from .publish import publish
 
         print(", ".join(publish(arguments.reports, arguments.into)))
+    elif arguments.command == "stability":
+        from .stability_page import command
+
+        size = "exhaustive" if arguments.exhaustive else "quick" if arguments.quick else "usual"
+        command(size, arguments.only, arguments.out, arguments.into)
     elif arguments.command == "show":
         from .results import read_report
         from .show import markdown, print_report

@@ -1,0 +1,330 @@
+"""Stress of cameras, lenses, rays and boxes."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from monopart.geometry.boxes import ray_box
+from monopart.geometry.cameras import MIN_DEPTH, Camera, Rays
+from monopart.geometry.distortion import distort_extended
+from monopart.geometry.rotations import axis_angle_to_rotmat
+
+from .registry import load
+from .stability_cases import DOUBLE, Family, Inputs, Stress, Way
+from .stability_rotations import Make, axes
+
+LENSES = {
+    "pinhole": (),
+    "usual lens": (-0.25, 0.11, 0.001, -0.0005, -0.02),
+    "strong barrel": (-0.5, 0.1, 0.0, 0.0, 0.0),
+    "strong pincushion": (0.6, 0.5, 0.0, 0.0, 0.0),
+    "rational, prism": (0.1, 0.02, 1e-3, 1e-3, 0.01, 0.2, 0.05, 0.01, 1e-3, 1e-4, 1e-3, 1e-4),
+}
+
+
+def camera(
+    lens: str = "pinhole", focal: float = 1000.0, centre: float = 256.0, away: float = 0.0
+) -> Camera:
+    """A turned camera of 512² pixels, at a distance from the origin; float32 can hold its numbers.
+
+    Args:
+        lens: one of `LENSES`.
+        focal: pixels.
+        centre: both coordinates of the principal point, pixels.
+        away: metres along the diagonal.
+    """
+    K = torch.tensor([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
+    R = axis_angle_to_rotmat(torch.tensor([0.3, -0.7, 0.2]))
+    t = torch.tensor([0.1, -0.2, 0.5]) - R @ torch.full((3,), away)
+    coefficients = torch.tensor(LENSES[lens])
+    return Camera(K.double(), R.double(), t.double(), (512, 512), coefficients.double())
+
+
+def _ahead(camera: Camera, depth: tuple[float, float], spread: float) -> Make:
+    """World points at depths, and at a spread of x/z and y/z."""
+
+    def make(generator: torch.Generator, count: int) -> Inputs:
+        share = torch.rand(count, 1, generator=generator, dtype=DOUBLE)
+        z = depth[0] + share * (depth[1] - depth[0])
+        plane = spread * (2 * torch.rand(count, 2, generator=generator, dtype=DOUBLE) - 1)
+        local = torch.cat((plane * z, z), 1)
+        return ((local - camera.t) @ camera.R,)
+
+    return make
+
+
+# --- oracles -----------------------------------------------------------------------------------
+
+
+def exact_lens(camera: Camera, plane: np.ndarray) -> np.ndarray:
+    """Brown and Conrady's lens up to the fold, in proportion beyond it."""
+    limit = min(camera.fold_radius, 1e3) if camera.is_distorted else math.inf
+    stretch = np.maximum(np.linalg.norm(plane, axis=1) / limit, 1.0)
+    x, y = (plane / stretch[:, None]).T
+    k = [*camera.distortion.tolist(), *[0.0] * 12][:12]
+    r = x * x + y * y
+    radial = (1 + k[0] * r + k[1] * r**2 + k[4] * r**3) / (1 + k[5] * r + k[6] * r**2 + k[7] * r**3)
+    u = x * radial + 2 * k[2] * x * y + k[3] * (r + 2 * x * x) + k[8] * r + k[9] * r**2
+    v = y * radial + k[2] * (r + 2 * y * y) + 2 * k[3] * x * y + k[10] * r + k[11] * r**2
+    return np.stack((u, v), 1) * stretch[:, None]
+
+
+def exact_pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """World to pixels; behind the camera the pixel of no answer."""
+    K, R, t = (x.numpy() for x in (camera.K, camera.R, camera.t))
+    local = np.stack([R @ p + t for p in points])
+    front = local[:, 2:] > MIN_DEPTH
+    plane = np.where(front, local[:, :2], 0.0) / np.where(front, local[:, 2:], 1.0)
+    pixels = exact_lens(camera, plane) @ K[:2, :2].T + K[:2, 2]
+    return np.where(front, pixels, -512.0)
+
+
+def _pixel_scale(camera: Camera, exact: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """What an error as large as the largest coordinate would do to a pixel, to first order."""
+    R, t = camera.R.numpy(), camera.t.numpy()
+    local = points @ R.T + t
+    largest = np.maximum(np.abs(points).max(1), np.abs(t).max())
+    z = np.maximum(local[:, 2], MIN_DEPTH)
+    slope = np.linalg.norm(local[:, :2], axis=1) / z
+    bent = np.linalg.norm(exact - camera.K.numpy()[:2, 2], axis=1) / float(camera.K[0, 0])
+    carried = float(camera.K[0, 0]) * largest / z * (1 + np.maximum(slope, bent))
+    return np.maximum(np.maximum(carried, np.abs(exact).max(1)), 512.0)
+
+
+# --- projection --------------------------------------------------------------------------------
+
+
+def _kornia(camera: Camera, points: Tensor) -> Tensor:
+    like = camera.to(points)
+    local = points @ like.R.mT + like.t
+    return load("kornia.geometry").project_points(local, like.K.expand(len(points), -1, -1))
+
+
+def _opencv(camera: Camera, points: Tensor) -> Tensor:
+    cv2, like = load("cv2"), camera.to(points)
+    lens = like.distortion.double().numpy() if like.is_distorted else None
+    local = (points @ like.R.mT + like.t).numpy()[:, None]  # its rotation vectors would round R
+    still = np.zeros(3)
+    found = cv2.projectPoints(local, still, still, like.K.double().numpy(), lens)[0]
+    return torch.from_numpy(found[:, 0])
+
+
+def _project_families() -> tuple[Family, ...]:
+    plain, far = camera(), camera(away=1e5)
+    grazing = _ahead(plain, (0.1, 0.2), 500.0)
+    out = [
+        Family("3 m", _ahead(plain, (2.0, 4.0), 0.3), extra=plain, step=1e-6),
+        Family("depth 1e-2", _ahead(plain, (1e-2, 2e-2), 0.3), extra=plain, step=1e-8),
+        Family("depth 1e-5", _ahead(plain, (1e-5, 2e-5), 0.3), extra=plain, step=1e-11, slope=0.1),
+        Family("depth 0", _ahead(plain, (0.0, 0.0), 0.3), extra=plain, smooth=False),
+        Family("behind", _ahead(plain, (-4.0, -1e-3), 0.3), extra=plain),
+        Family("1 km", _ahead(plain, (900.0, 1100.0), 0.3), extra=plain, step=1e-3),
+        Family("89.9° off axis", grazing, extra=plain, step=1e-6, slope=1e-3),
+        Family("100 km away", _ahead(far, (2.0, 4.0), 0.3), extra=far, step=1e-4, slope=0.1),
+    ]
+    for name, one in (
+        *(("focal 1", camera(focal=1.0)), ("focal 1e6", camera(focal=1e6))),
+        ("principal point outside", camera(centre=-5000.0)),
+    ):
+        out.append(Family(name, _ahead(one, (2.0, 4.0), 0.3), extra=one, step=1e-6))
+    for lens in list(LENSES)[1:]:
+        one = camera(lens)
+        out.append(Family(lens, _ahead(one, (2.0, 4.0), 0.4), extra=one, step=1e-6))
+        beyond = _ahead(one, (0.2, 0.4), 20.0)
+        out.append(Family(f"{lens}, beyond", beyond, extra=one, step=1e-7, smooth=False))
+    return tuple(out)
+
+
+def _project() -> Stress:
+    return Stress(
+        name="project",
+        title="projection",
+        domain="any point; nearer than 1 µm or behind: the pixel (-width, -height), no gradient; "
+        "beyond the fold of a lens: continued outwards",
+        error="f·S/z·(1 + r): an error of S, the largest coordinate, carried into the image",
+        families=_project_families(),
+        ways=(
+            Way("monopart", lambda cam, p: cam.project(p)[0], True),
+            Way("kornia", _kornia, modules=("kornia",), serves=lambda f: not f.extra.is_distorted),
+            Way("OpenCV", _opencv, modules=("cv2",), differentiable=False),
+        ),
+        exact=exact_pixels,
+        scale=_pixel_scale,
+    )
+
+
+# --- rays --------------------------------------------------------------------------------------
+
+
+def _image(camera: Camera, reach: float, special: bool = False) -> Make:
+    """Pixels around the principal point, reaching so many focal lengths from it."""
+
+    def make(generator: torch.Generator, count: int) -> Inputs:
+        place = reach * (2 * torch.rand(count, 2, generator=generator, dtype=DOUBLE) - 1)
+        if special:
+            place[: count // 2] = 0  # along the optical axis
+            place[count // 2 :, 0] = 0
+        return (place * float(camera.K[0, 0]) + camera.K[:2, 2],)
+
+    return make
+
+
+def exact_directions(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Unit directions of a pinhole."""
+    K, R = camera.K.numpy(), camera.R.numpy()
+    plane = (pixels - K[:2, 2]) / K[0, 0]
+    # not of unit length before it is turned: float32 has no exact rotations
+    turned = np.concatenate((plane, np.ones((len(plane), 1))), 1) @ R
+    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+def _rays() -> Stress:
+    families = []
+    for name, one, reach, special in (
+        *(("usual", camera(), 0.3, False), ("along axes", camera(), 0.3, True)),
+        *(("89.9° off axis", camera(), 500.0, False), ("focal 1", camera(focal=1.0), 256.0, False)),
+        ("focal 1e6", camera(focal=1e6), 3e-4, False),
+        ("principal point outside", camera(centre=-5000.0), 5.0, False),
+    ):
+        step = 1e-6 * float(one.K[0, 0])
+        families.append(Family(name, _image(one, reach, special), extra=one, step=step, slope=1e-3))
+    return Stress(
+        name="rays",
+        title="rays of a pinhole",
+        domain="any finite pixel",
+        error="1 rad",
+        families=tuple(families),
+        ways=(Way("monopart", lambda cam, px: cam.rays(px).directions, True),),
+        exact=exact_directions,
+    )
+
+
+def _back(camera: Camera, plane: Tensor) -> Tensor:
+    """Ideal points to pixels in float64."""
+    bent = distort_extended(plane.double(), camera.distortion, camera.fold_radius)
+    return bent @ camera.K[:2, :2].mT + camera.K[:2, 2]
+
+
+def _our_undistort(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    rays, valid = camera.rays_with_mask(pixels)
+    local = rays.directions.double() @ torch.linalg.inv(camera.R)
+    return _back(camera, local[:, :2] / local[:, 2:]), valid
+
+
+def _kornia_undistort(camera: Camera, pixels: Tensor) -> Tensor:
+    like, undistort = camera.to(pixels), load("kornia.geometry.calibration").undistort_points
+    unit = torch.eye(3).to(pixels)[None]
+    return _back(camera, undistort(pixels[None], like.K[None], like.distortion[None], unit, 20)[0])
+
+
+def _opencv_undistort(camera: Camera, pixels: Tensor) -> Tensor:
+    cv2 = load("cv2")
+    stop = (cv2.TERM_CRITERIA_COUNT, 20, 0.0)
+    K, lens = camera.K.numpy(), camera.distortion.numpy()
+    found = cv2.undistortPoints(pixels.numpy()[:, None], K, lens, R=None, P=None, criteria=stop)
+    return _back(camera, torch.from_numpy(np.asarray(found)[:, 0]))
+
+
+def _ray_scale(camera: Camera, exact: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    focal = float(camera.K[0, 0])
+    r = np.linalg.norm(pixels - camera.K.numpy()[:2, 2], axis=1) / focal
+    return np.maximum(focal * (1 + r * r), np.abs(pixels).max(1))
+
+
+def _undistort() -> Stress:
+    families = []
+    for lens in list(LENSES)[1:]:
+        one = camera(lens)
+        for name, reach in ((lens, 0.3), (f"{lens}, edge", 0.6), (f"{lens}, beyond", 30.0)):
+            make = _image(one, reach)
+            families.append(Family(name, make, extra=one, step=1e-3, smooth="beyond" not in name))
+    return Stress(
+        name="undistort",
+        title="rays through a lens (pixel they come back to)",
+        domain="pixels that the lens can see; others, beyond its fold, are masked",
+        error="f·(1 + r²), in pixels: the last place of a direction",
+        families=tuple(families),
+        ways=(
+            Way("monopart", _our_undistort, True),
+            Way("kornia, 20 steps", _kornia_undistort, modules=("kornia",)),
+            Way("OpenCV, 20 steps", _opencv_undistort, modules=("cv2",), differentiable=False),
+        ),
+        exact=lambda cam, pixels: pixels,
+        scale=_ray_scale,
+    )
+
+
+# --- rays and boxes ----------------------------------------------------------------------------
+
+
+def _lines(kind: str) -> Make:
+    """Rays against the unit cube; coordinates of special ones are exact in every precision."""
+
+    def make(generator: torch.Generator, count: int) -> Inputs:
+        origins = 3 * torch.randn(count, 3, generator=generator, dtype=DOUBLE)
+        directions = axes(generator, count)
+        if kind == "inside":
+            origins = torch.rand(count, 3, generator=generator, dtype=DOUBLE)
+        elif kind != "any":
+            rows, axis = torch.arange(count), torch.arange(count) % 3
+            directions = torch.eye(3, dtype=DOUBLE)[axis]
+            origins = torch.rand(count, 3, generator=generator, dtype=DOUBLE)
+            if kind == "in a face":
+                origins[rows, (axis + 1) % 3] = 1.0
+            origins[rows, axis] = -2.0
+        if kind == "nearly parallel":
+            directions = directions + 1e-20
+        return origins, directions
+
+    return make
+
+
+def exact_box(extra: Any, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Near and far by slabs, one axis after the other; 0 and 0 where missed."""
+    out = np.zeros((len(origins), 2))
+    for i, (o, d) in enumerate(zip(origins, directions, strict=True)):
+        near, far, hit = -np.inf, np.inf, True
+        for a in range(3):
+            if abs(d[a]) < 1e-15:
+                hit = hit and 0 <= o[a] <= 1
+            else:
+                one, two = -o[a] / d[a], (1 - o[a]) / d[a]
+                near, far = max(near, min(one, two)), min(far, max(one, two))
+        if hit and far >= max(near, 0):
+            out[i] = max(near, 0), far
+    return out
+
+
+def _box_scale(
+    extra: None, exact: np.ndarray, origins: np.ndarray, directions: np.ndarray
+) -> np.ndarray:
+    return 1 + np.abs(origins).max(1) + np.abs(exact).max(1)
+
+
+def _boxes() -> Stress:
+    def run(extra: None, origins: Tensor, directions: Tensor) -> Tensor:
+        lo, hi = torch.zeros(3).to(origins), torch.ones(3).to(origins)
+        near, far, _ = ray_box(Rays(origins, directions), lo, hi)
+        return torch.stack((near, far), 1)
+
+    kinds = ("any", "inside", "along axes", "in a face", "nearly parallel")
+    families = [Family(k, _lines(k), smooth=k in ("any", "inside"), step=1e-8) for k in kinds]
+    return Stress(
+        name="ray_box",
+        title="rays and boxes",
+        domain="any rays; along an axis and in a face too, without a division",
+        error="1 + largest coordinate + distance along the ray",
+        families=tuple(families),
+        ways=(Way("monopart", run, True),),
+        exact=exact_box,
+        scale=_box_scale,
+        wrt=(0, 1),
+    )
+
+
+def stresses() -> list[Stress]:
+    """Operations on cameras and rays."""
+    return [_project(), _rays(), _undistort(), _boxes()]

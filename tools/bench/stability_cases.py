@@ -1,0 +1,156 @@
+"""What a stress is made of: families of inputs, implementations, and what a run found."""
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Inputs = tuple[Tensor, ...]
+SINGLE, DOUBLE = torch.float32, torch.float64
+HALVES = (torch.float16, torch.bfloat16)
+
+
+@dataclass(frozen=True)
+class Family:
+    """Inputs of one kind."""
+
+    name: str
+    """Shown in tables."""
+    make: Callable[[torch.Generator, int], Inputs]
+    """Inputs in float64 of about a given number of cases: the rows of the result."""
+    inside: bool = True
+    """Inside the stated domain; outside it only the outcome is reported."""
+    smooth: bool = True
+    """The gradient is continuous here, so that it can be compared; else it must be finite."""
+    step: float = 1e-5
+    """Step of the central differences, in the unit of the inputs."""
+    extra: Any = None
+    """What is not a float: faces, a tree, a camera."""
+    cases: int | None = None
+    """Largest number of cases."""
+    large: bool = False
+    """Only in exhaustive runs; ``extra`` is a function that makes it then."""
+    halves: bool = True
+    """Inside the range of float16 too."""
+    slope: float = 1e-4
+    """Largest relative error of a float32 gradient; the tests hold it."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """One implementation."""
+
+    name: str
+    """Shown in tables."""
+    run: Callable[..., Tensor | tuple[Tensor, Tensor]]
+    """(extra, *inputs) to results, one row a case, and the mask of valid rows where it has one."""
+    ours: bool = False
+    """Whether it is part of monopart."""
+    dtypes: tuple[torch.dtype, ...] = (SINGLE, DOUBLE)
+    """Precisions that it takes."""
+    modules: tuple[str, ...] = ()
+    """What must be importable."""
+    differentiable: bool = True
+    """Whether it has gradients."""
+    serves: Callable[[Family], bool] = lambda family: True
+    """Families that it is made for."""
+    limit: float | None = None
+    """Largest relative error in float32, where it is not that of the operation."""
+    double: float | None = None
+    """The same in float64."""
+
+    def absent(self) -> str | None:
+        """The first module that is not installed, or None."""
+        return next((m for m in self.modules if importlib.util.find_spec(m) is None), None)
+
+
+@dataclass(frozen=True)
+class Stress:
+    """An operation, its domain, its families and its implementations."""
+
+    name: str
+    """For the command line."""
+    title: str
+    """For people."""
+    domain: str
+    """Where it is promised to hold, and what happens outside."""
+    error: str
+    """What the error is relative to."""
+    families: tuple[Family, ...]
+    """Kinds of input."""
+    ways: tuple[Way, ...]
+    """Ours first."""
+    exact: Callable[..., np.ndarray]
+    """(extra, *inputs as float64 arrays) to exact results."""
+    scale: Callable[..., np.ndarray | float] = lambda extra, exact, *inputs: 1.0
+    """(extra, exact, *inputs) to the size, per row, that errors are relative to."""
+    off: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    """(result, exact) to the error of each row; None is the largest entry of the difference."""
+    wrt: tuple[int, ...] = (0,)
+    """Inputs that gradients are taken in."""
+    cases: int = 256
+    """Cases of a family."""
+    rows_apart: bool = True
+    """A row of the result depends on the same row of the inputs only, where they have as many."""
+    limit: float = 1e-6
+    """Largest relative error in float32 inside the domain; the tests hold it."""
+    double: float = 1e-13
+    """The same in float64."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One implementation on one family in one precision."""
+
+    operation: str
+    family: str
+    way: str
+    ours: bool
+    dtype: str
+    inside: bool
+    cases: int
+    """Rows of the result."""
+    masked: int
+    """Rows that the operation itself declared to have no answer."""
+    value: float | None
+    """Largest error relative to the scale."""
+    absolute: float | None
+    """Largest error in the unit of the result."""
+    gradient: float | None
+    """Largest error of the gradient: against float64, or of float64 against differences."""
+    amplification: float | None
+    """Largest |gradient| times |input| over |result|: a bound on what rounding can do."""
+    bad_values: int
+    """Rows that are not finite and not masked."""
+    bad_gradients: int
+    """Rows (or entries) of gradients that are not finite."""
+    raised: str = ""
+    """The error that stopped it, if any."""
+
+    @property
+    def kind(self) -> torch.dtype:
+        """The precision."""
+        return getattr(torch, self.dtype)
+
+    @property
+    def ulp(self) -> float | None:
+        """The value error in units of the last place of the scale."""
+        return None if self.value is None else self.value / torch.finfo(self.kind).eps
+
+
+@dataclass
+class Outcome:
+    """All cells of a run, with the operations they belong to."""
+
+    cells: list[Cell] = field(default_factory=list)
+    absent: dict[str, str] = field(default_factory=dict)
+    """Implementations that are not installed, with the missing module."""
+
+    @property
+    def cases(self) -> int:
+        """Cases over everything that ran."""
+        return sum(cell.cases for cell in self.cells)
