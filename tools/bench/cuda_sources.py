@@ -162,9 +162,9 @@ def print_compiled(archs: tuple[int, ...]) -> None:
     if not has_compiler():
         raise BackendError("cuda-sources: this build of Warp has no CUDA compiler; use Linux")
     table = Table(title="Kernels compiled for CUDA (no GPU ran them)")
-    table.add_column("kernel")
+    table.add_column("kernel", no_wrap=True)
     for arch in archs:
-        table.add_column(f"sm_{arch}: kB of PTX, registers, stack bytes", justify="right")
+        table.add_column(f"sm_{arch}", justify="right", no_wrap=True)
     cells: dict[str, list[str]] = {}
     for arch in archs:
         for entry in compile_all(arch):
@@ -172,6 +172,6 @@ def print_compiled(archs: tuple[int, ...]) -> None:
             row = cells.setdefault(entry.name, [])
             row.append(f"{size:.0f}  {needs.registers:>3}  {needs.stack:>4}")
     for name, row in cells.items():
-        table.add_row(name.removeprefix("monopart."), *row)
-    table.caption = "PTX is that of the whole module of the kernel; registers and stack per thread"
+        table.add_row(name.removeprefix("monopart.").replace(".kernels.", "."), *row)
+    table.caption = "kB of PTX of the kernel's module; registers and bytes of stack per thread"
     Console(width=120).print(table)
