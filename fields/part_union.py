@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from monopart.geometry.parts import rows_of_parts
+
 
 @dataclass(frozen=True)
 class Union:
@@ -61,5 +63,4 @@ def union_by_density(
     winner = rows[won]
     total = torch.zeros(num_samples, dtype=sigma.dtype, device=sigma.device)
     total = total.index_copy(0, sample[winner], sigma[winner])
-    counts = torch.bincount(part[winner], minlength=num_parts).tolist()
-    return Union(total, winner, tuple(counts))
+    return Union(total, winner, rows_of_parts(part[winner], num_parts))

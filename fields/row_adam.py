@@ -86,7 +86,7 @@ def row_adam(
     """
     beta1, beta2 = rule.betas
     scaled, root = rate / (1 - beta1**now), 1 / math.sqrt(1 - beta2**now)
-    decay = _missed(beta1, beta2).to(table)
+    decay = _missed(beta1, beta2, table.device, table.dtype)
     chosen = choose_backend(backend, table)
     if chosen == "warp" and table.shape[1] > _WIDEST:
         if backend == "warp":
@@ -133,7 +133,7 @@ def _row_adam_torch(
 
 
 @functools.cache
-def _missed(beta1: float, beta2: float) -> Tensor:
+def _missed(beta1: float, beta2: float, device: torch.device, dtype: torch.dtype) -> Tensor:
     """[gap, 3]: factors of the moments and the sum of the missed movements after resting steps.
 
     A resting row moves by rate · mean/root mean square, and that ratio falls by beta1/sqrt(beta2)
@@ -142,7 +142,7 @@ def _missed(beta1: float, beta2: float) -> Tensor:
     gap = torch.arange(_LONGEST, dtype=torch.float64)
     ratio = beta1 / math.sqrt(beta2)
     movement = gap if ratio == 1 else ratio * (1 - ratio**gap) / (1 - ratio)
-    return torch.stack([beta1**gap, beta2**gap, movement], -1).float().contiguous()
+    return torch.stack([beta1**gap, beta2**gap, movement], -1).to(device, dtype)
 
 
 class RowAdam(torch.optim.Optimizer):

@@ -167,8 +167,10 @@ class BodyShell:
         from .kernels.shell import splat_bodies
 
         self.grid = torch.zeros(total, dtype=torch.int32, device=verts.device)
-        args = [view(verts, 3), view(bits), view(reach), *self._grid_args()]
-        launch(splat_bodies, verts.shape[0], args, verts, smallest=2)
+        bodies, count = verts.shape[:2]
+        share = count if verts.device.type == "cpu" else 1  # vertices of one work item
+        args = [view(verts, 3), view(bits), view(reach), *self._grid_args(), share]
+        launch(splat_bodies, bodies * (count // share), args, verts, smallest=2)
         return self.grid
 
     def _grid_args(self) -> list:
@@ -290,14 +292,14 @@ class BodyShell:
         launch(count_samples, count, [*common, view(kept), view(dense)], origins)
         ray_start = torch.zeros(count + 1, dtype=torch.int64, device=device)
         torch.cumsum(kept, 0, out=ray_start[1:])
-        total = int(ray_start[-1])
+        total, in_boxes = torch.stack([ray_start[-1], dense.sum()]).tolist()
         points = torch.zeros(total, 3, device=device)
         depth = torch.zeros(total, device=device)
         ints = torch.zeros(3, total, dtype=torch.int32, device=device)
         ray, owner, candidates = ints.unbind(0)
         out = [view(points, 3), view(depth), view(ray), view(owner), view(candidates)]
         launch(fill_samples, count, [*common, view(ray_start), *out], origins)
-        return ShellSamples(points, depth, ray, owner, candidates, ray_start, int(dense.sum()))
+        return ShellSamples(points, depth, ray, owner, candidates, ray_start, in_boxes)
 
 
 def _flat(rays: Rays) -> tuple[Tensor, Tensor]:

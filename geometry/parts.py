@@ -1,5 +1,6 @@
 """Division of a body into parts, by the joint that moves each vertex most."""
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -209,3 +210,21 @@ class PartMap:
                 f"{weights.shape[-1]}; make the part map for this body"
             )
         return torch.tensor(self.joint_part, device=weights.device)
+
+
+def rows_of_parts(part: Int[Tensor, "m"], num_parts: int) -> tuple[int, ...]:
+    """Number of rows of each part, where rows are sorted by part; waits once for the device.
+
+    Args:
+        part: part of each row, ascending.
+        num_parts: number of parts.
+
+    Returns:
+        One number per part.
+
+    >>> rows_of_parts(torch.tensor([0, 0, 2]), 4)
+    (2, 0, 1, 0)
+    """
+    edges = torch.arange(num_parts + 1, device=part.device, dtype=part.dtype)
+    ends = torch.searchsorted(part.contiguous(), edges).tolist()
+    return tuple(end - start for start, end in itertools.pairwise(ends))

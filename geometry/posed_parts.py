@@ -17,7 +17,7 @@ from .body import BodyModel, PosedBody
 from .culling import BodyShell, ShellSamples
 from .errors import InputError
 from .face_tree import FaceTrees
-from .parts import PartMap
+from .parts import PartMap, rows_of_parts
 from .rigid import append_last_row, invert_affine, transform_points
 from .skinning import blend_transforms
 
@@ -164,9 +164,8 @@ class PosedParts:
         """
         face, bary = self._search(samples.points, samples.body, samples.candidates, self.radius)
         part, sample = torch.nonzero(face >= 0, as_tuple=True)
-        counts = torch.bincount(part, minlength=self.num_parts).tolist()
-        found = face[part, sample].long()
-        return PartPairs(sample, part, found, bary[part, sample], tuple(counts))
+        counts = rows_of_parts(part, self.num_parts)
+        return PartPairs(sample, part, face[part, sample].long(), bary[part, sample], counts)
 
     def unskin(self, samples: ShellSamples, pairs: PartPairs) -> RestPoints:
         """Canonical point B(w) A(w)^-1 p and UV of each pair (MonoPartNeRF, eq. 1, rigid term).

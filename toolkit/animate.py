@@ -66,4 +66,4 @@ def world_up(cameras: list[Camera]) -> torch.Tensor:
 
 def as_uint8(image: torch.Tensor) -> np.ndarray:
     """A float image in [0, 1] as eight bits a channel."""
-    return (image * 255.0).round().clamp(0, 255).to(torch.uint8).numpy()
+    return (image * 255.0).round().clamp(0, 255).to(torch.uint8).cpu().numpy()

@@ -28,6 +28,7 @@ info tells where it is and how large."""
 SPLITS = ("novel_view", "novel_pose")
 OF_PRESET = "(default: the preset's)"
 
+Device = Annotated[str, arg(metavar="cpu|cuda|cuda:N|auto")]
 CaptureArg = Annotated[Positional[Path], arg(metavar="CAPTURE")]
 RunArg = Annotated[Positional[Path], arg(metavar="RUN")]
 OutRun = Annotated[Path, arg(metavar="RUN")]
@@ -82,6 +83,8 @@ class Train:
     """Measure where a step's time goes first; writes profile.html and profile.json (a trace)."""
     resume: bool = False
     """Go on with the unfinished run in --out, with its own configuration."""
+    device: Device = "cpu"
+    """Where to train and render; auto is a GPU where there is one."""
 
     def run(self) -> None:
         """Do it."""
@@ -94,10 +97,8 @@ class Train:
             self.out,
             config,
             params=self.params,
-            images=self.images,
-            explain=self.explain,
+            extras=commands.Extras(self.images, self.explain, self.profile, self.device),
             resume=self.resume,
-            profile=self.profile,
         )
 
 
@@ -118,6 +119,8 @@ class Eval:
     """Images to score per split, evenly spread; the run folder is then left as it is."""
     capture: MovedCapture = None
     """Folder of the capture, if it has moved."""
+    device: Device = "cpu"
+    """Where to render; auto is a GPU where there is one."""
 
     def run(self) -> None:
         """Do it."""
@@ -128,7 +131,7 @@ class Eval:
             )
         from . import commands
 
-        commands.evaluate(self.run_folder, self.split, self.capture, self.images)
+        commands.evaluate(self.run_folder, self.split, self.capture, self.images, self.device)
 
 
 @dataclass(frozen=True)
@@ -154,6 +157,8 @@ class Render:
     """Look at every N-th sample of a ray first and fill in where there is something; 1 is exact."""
     half: bool = False
     """Run the networks in float16 (for GPUs: slower on a CPU)."""
+    device: Device = "cpu"
+    """Where to render; auto is a GPU where there is one."""
 
     def run(self) -> None:
         """Do it."""
@@ -170,7 +175,7 @@ class Render:
             self.frame,
             self.out,
             self.capture,
-            commands.Choices(self.explain, self.coarse, self.half, skip),
+            commands.Choices(self.explain, self.coarse, self.half, skip, self.device),
         )
 
 
@@ -194,6 +199,8 @@ class Turntable:
     """Longer side of the video, pixels, from 16."""
     capture: MovedCapture = None
     """Folder of the capture, if it has moved."""
+    device: Device = "cpu"
+    """Where to render; auto is a GPU where there is one."""
 
     def run(self) -> None:
         """Do it."""
@@ -203,7 +210,13 @@ class Turntable:
         from . import commands
 
         commands.turntable(
-            self.run_folder, self.out, self.frames, self.frame, self.size, self.capture
+            self.run_folder,
+            self.out,
+            self.frames,
+            self.frame,
+            self.size,
+            self.capture,
+            self.device,
         )
 
 
@@ -234,6 +247,8 @@ class Demo:
     """Folder of the capture."""
     set: Settings = ()
     """Entries of the configuration to replace, such as train.seconds=60."""
+    device: Device = "cpu"
+    """Where to train and render; auto is a GPU where there is one."""
 
     def run(self) -> None:
         """Do it."""
@@ -245,7 +260,7 @@ class Demo:
             )
         from . import commands
 
-        commands.demo(self.capture, self.out, config)
+        commands.demo(self.capture, self.out, config, self.device)
 
 
 Command = Train | Eval | Render | Turntable | Info | Demo

@@ -39,7 +39,7 @@ class Avatar:
 
     @classmethod
     def create(cls, record: CaptureRecord, config: Config, cache: Cache = NO_CACHE) -> "Avatar":
-        """An untrained avatar of a capture, from the global random state."""
+        """An untrained avatar on the device of a capture, from the global random state."""
         frames = record.split("train").frames
         canonical = canonical_body(record)
         poses = torch.stack([record.poses[f].pose for f in frames])
@@ -47,7 +47,13 @@ class Avatar:
         if config.field.prior_slope:
             prior = distance_prior(canonical.verts, record.body.faces, cache)
         model = AvatarModel(config, record.body, canonical, len(frames), prior)
+        model.to(canonical.verts.device)  # initial values are drawn on the CPU: the same anywhere
         return cls(record, config, canonical, PoseMemory.build(frames, poses), model, cache)
+
+    @property
+    def device(self) -> torch.device:
+        """Where bodies and model are."""
+        return self.canonical.verts.device
 
     def scene(self, frames: tuple[int, ...]) -> SceneBodies:
         """Posed bodies of frames of the capture."""
@@ -60,7 +66,7 @@ class Avatar:
 
     def training_input(self) -> FrameInput:
         """Times and codes of the training frames, in order; codes carry gradients."""
-        rows = torch.arange(len(self.memory.frames))
+        rows = torch.arange(len(self.memory.frames), device=self.device)
         return FrameInput(self.memory.time(rows), self.model.codes)
 
     def frame_input(self, frame: int | None, pose: BodyPose) -> FrameInput:

@@ -19,7 +19,9 @@ from .avatar import Avatar, View
 from .cache import user_cache
 from .captures import check_capture, describe, read_capture
 from .captures.cache import read_pictures
+from .choices import Choices, Extras
 from .config import Config
+from .device import pick_device
 from .explain import print_skipping, why_empty
 from .profile_page import print_profile, write_profile
 from .profiling import profile_training
@@ -29,7 +31,6 @@ from .results import evaluate_splits, held_out, say, skipping, summary, write_re
 from .resume import load_state
 from .runs import check_free, create_run, next_free, open_run, read_facts, resumable
 from .savings import print_savings, rendering_savings, training_savings
-from .skipping import EVERY, Skipping
 from .train import Trainer, TrainResult
 from .video import save_png, write_video
 
@@ -59,10 +60,8 @@ def train(
     out: Path,
     config: Config,
     params: str | None = None,
-    images: int | None = None,
-    explain: bool = False,
+    extras: Extras | None = None,
     resume: bool = False,
-    profile: bool = False,
 ) -> Path:
     """Train on a capture, evaluate, write the report; the scores and its path go to stdout.
 
@@ -73,10 +72,8 @@ def train(
         out: run folder to make.
         config: the resolved configuration.
         params: name of the folder of body poses, None for the capture's own.
-        images: held-out images to evaluate per split; None for all.
-        explain: print the table of what was skipped, and the time that each kind saves.
+        extras: what is done beside the training, and where.
         resume: go on with an unfinished run in ``out``, with its own configuration.
-        profile: measure the stages of a step first; writes profile.json and profile.html.
 
     Returns:
         The report.
@@ -85,41 +82,44 @@ def train(
         InputError: a fault in the capture, or a run folder that exists.
         KeyboardInterrupt: the training was interrupted; everything is written.
     """
-    stages = Stages()
-    trainer = _trainer(capture, out, config, params, stages, resume)
-    if profile:
+    stages, extras = Stages(), extras or Extras()
+    device = pick_device(extras.device)
+    trainer = _trainer(capture, out, config, params, stages, device, resume)
+    if extras.profile:
         _profile(trainer, out)
     interrupted = _train(trainer, stages)
     avatar, result = trainer.avatar, trainer.result
-    if explain:
+    if extras.explain:
         print_savings("What skipping saves in a training step", training_savings(trainer))
     with stages.timed("evaluation"):
-        evaluations = evaluate_splits(avatar, held_out(avatar.record), images)
+        evaluations = evaluate_splits(avatar, held_out(avatar.record), extras.images)
     size = min(STRIP_SIZE, *avatar.record.image_size)
     with stages.timed("turntable strip"):
         strip = [as_uint8(p.color) for p in turn(avatar, STRIP_VIEWS, size=size)]
-    report = write_results(out, avatar, result, evaluations, stages.seconds, strip, explain)
+    report = write_results(out, avatar, result, evaluations, stages.seconds, strip, extras.explain)
     print(f"report: {report}", flush=True)
     if interrupted:
         raise KeyboardInterrupt
     return report
 
 
-def demo(capture: Path, out: Path, config: Config) -> Path:
+def demo(capture: Path, out: Path, config: Config, device: str = "cpu") -> Path:
     """Train, evaluate, write a turntable video and the report; the last line says where it is.
 
     Args:
         capture: folder of the capture.
         out: run folder to make; where it exists, the next free name is taken.
         config: the resolved configuration.
+        device: see :func:`pick_device`.
 
     Returns:
         The report.
     """
+    there = pick_device(device)
     run, stages = next_free(out), Stages()
     if run != out:
         say(f"{out} exists; this run goes to {run}")
-    trainer = _trainer(capture, run, config, None, stages)
+    trainer = _trainer(capture, run, config, None, stages, there)
     interrupted = _train(trainer, stages)
     avatar, result = trainer.avatar, trainer.result
     with stages.timed("evaluation"):
@@ -142,6 +142,7 @@ def _trainer(
     config: Config,
     params: str | None,
     stages: Stages,
+    device: torch.device,
     resume: bool = False,
 ) -> Trainer:
     """Everything that a training needs, read and prepared; the run folder is made."""
@@ -155,6 +156,7 @@ def _trainer(
             record, "train", cache, lambda i, n: update(0.6 * i / n, f"image {i}/{n}")
         )
         check_capture(record, deep=True, masks=pictures.masks)
+        record = record.to(device)
         run = out if resume else create_run(out, config, record)
         torch.manual_seed(config.seed)
         update(0.6, "canonical body")
@@ -211,7 +213,9 @@ def _run_loop(trainer: Trainer) -> bool:
     return False
 
 
-def evaluate(run: Path, split: str | None, capture: Path | None, images: int | None) -> None:
+def evaluate(
+    run: Path, split: str | None, capture: Path | None, images: int | None, device: str = "cpu"
+) -> None:
     """Score a run; all images of all splits also rebuild its report.
 
     Args:
@@ -219,8 +223,9 @@ def evaluate(run: Path, split: str | None, capture: Path | None, images: int | N
         split: name of one split; None for all held-out ones.
         capture: the capture, if it has moved.
         images: images per split; the run folder is then left as it is. None for all.
+        device: see :func:`pick_device`.
     """
-    avatar, stages = open_run(run, capture), Stages()
+    avatar, stages = open_run(run, capture, pick_device(device)), Stages()
     path = run / "training.json"
     whole = images is None and split is None and path.is_file()
     training = _training_facts(path) if whole else None
@@ -253,23 +258,6 @@ def _training_facts(path: Path) -> tuple[TrainResult, dict[str, float]]:
     return TrainResult(**{n: facts[n] for n in names}), facts["stages"]
 
 
-@dataclass(frozen=True)
-class Choices:
-    """How a picture is made.
-
-    Attributes:
-        explain: print the table of what was skipped, and the time that each kind saves.
-        coarse: samples of a ray per coarse one; 1 is exact.
-        half: run the networks in float16.
-        skip: what to leave out.
-    """
-
-    explain: bool = False
-    coarse: int = 1
-    half: bool = False
-    skip: Skipping = EVERY
-
-
 def render(
     run: Path,
     camera: str,
@@ -288,7 +276,7 @@ def render(
         capture: the capture, if it has moved.
         choices: how.
     """
-    avatar = open_run(run, capture)
+    avatar = open_run(run, capture, pick_device(choices.device))
     index = avatar.record.camera_index(camera)
     view = View(avatar.record.cameras[index], pose_of(avatar.record, frame), frame)
     start = time.perf_counter()
@@ -328,7 +316,13 @@ def turn(
 
 
 def turntable(
-    run: Path, out: Path, frames: int, frame: int | None, size: int | None, capture: Path | None
+    run: Path,
+    out: Path,
+    frames: int,
+    frame: int | None,
+    size: int | None,
+    capture: Path | None,
+    device: str = "cpu",
 ) -> None:
     """Write a video of the person turning once.
 
@@ -339,8 +333,9 @@ def turntable(
         frame: frame that gives the pose; the first training frame if None.
         size: longer side, pixels; the training camera's if None.
         capture: the capture, if it has moved.
+        device: see :func:`pick_device`.
     """
-    avatar = open_run(run, capture)
+    avatar = open_run(run, capture, pick_device(device))
     pictures = turn(avatar, frames, frame, size)
     write_video(out, [as_uint8(p.color) for p in pictures], fps=FPS)
     print(out)

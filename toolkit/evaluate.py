@@ -89,7 +89,7 @@ def evaluate_split(
         seconds = time.perf_counter() - start
         stats.update(picture.stats)
         # What is scored is what is saved: eight bits a channel.
-        rendered = (picture.color * 255.0).round().to(torch.uint8)
+        rendered = (picture.color * 255.0).round().to(torch.uint8).cpu()
         truth, mask = record.masked_image(camera, frame), record.mask(camera, frame)
         scores = score_image(rendered.float() / 255.0, truth, mask, "strict", lpips)
         images.append(ImageScore(camera, frame, scores, seconds, rendered))

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from monopart.fields.residual import ResidualField
 from monopart.geometry.norms import safe_norm
+from monopart.geometry.parts import rows_of_parts
 from monopart.geometry.posed_parts import PosedParts
 
 from .model import AvatarModel, FrameInput, Rendered
@@ -50,7 +51,7 @@ def round_trip_distance(
     posed_point = bodies.reskin(points, owner, hit, canonical_parts)
     forward: ResidualField | None = model.forward_residual
     if forward is not None:
-        counts = torch.bincount(part, minlength=model.num_parts).tolist()
+        counts = rows_of_parts(part, model.num_parts)
         uvt = torch.cat([hit.uv, frames.time[owner, None]], -1)
         posed_point = posed_point + forward(uvt, part, counts)
     gap = safe_norm(out.samples.points[sample] - posed_point)

@@ -64,18 +64,18 @@ def march(
     step = model.config.geometry.step
     samples = bodies.shell.sample(rays, step)
     count = len(rays.directions)
-    color, light = torch.zeros(count, 3), torch.ones(count)
-    depth = torch.zeros(count)
+    like = samples.depth
+    color, light, depth = like.new_zeros(count, 3), like.new_ones(count), like.new_zeros(count)
     stats: Counter[str] = Counter(
         rays=count, samples_dense=samples.dense, samples_shell=len(samples.depth)
     )
     ray = samples.ray.long()
-    place = torch.arange(len(ray)) - samples.ray_start[ray]
+    place = torch.arange(len(ray), device=ray.device) - samples.ray_start[ray]
     for first, end in itertools.pairwise(ROUNDS if coarse == 1 else ROUNDS_COARSE):
         keep = (place >= first) & (place < end) & (light > SPENT)[ray]
-        if not bool(keep.any()):
-            break  # no ray has light and samples left
         part = samples.rows(keep)
+        if not len(part.depth):
+            break  # no ray has light and samples left
         if coarse > 1:
             lattice = (place[keep] - first) % coarse == 0
             shaded = _coarse_to_fine(model, bodies, frames, part, prune, lattice, skip)

@@ -53,7 +53,8 @@ class PoseMemory:
             Rows of the memory, nearest first, and weights that sum to 1.
         """
         if frame in self.frames:
-            return torch.tensor([self.frames.index(frame)]), torch.ones(1)
+            row = torch.tensor([self.frames.index(frame)], device=pose.device)
+            return row, torch.ones(1, device=pose.device)
         distance = self.distances(pose)
         near, rows = distance.topk(min(count, len(distance)), largest=False)
         return rows, torch.softmax(-(near**2) / (2 * self.width**2), 0)

@@ -15,7 +15,7 @@ from monopart.fields.volume import Composite, composite
 from monopart.geometry.body import BodyModel, PosedBody
 from monopart.geometry.cameras import Rays
 from monopart.geometry.culling import ShellSamples
-from monopart.geometry.parts import PartMap
+from monopart.geometry.parts import PartMap, rows_of_parts
 from monopart.geometry.posed_parts import PartPairs, PosedParts, RestPoints
 from monopart.geometry.stages import stage
 
@@ -83,8 +83,8 @@ class Rendered:
 def select(pairs: PartPairs, rows: Tensor, num_parts: int) -> PartPairs:
     """The pairs of the given ascending rows."""
     part = pairs.part[rows]
-    counts = torch.bincount(part, minlength=num_parts).tolist()
-    return PartPairs(pairs.sample[rows], part, pairs.face[rows], pairs.bary[rows], tuple(counts))
+    counts = rows_of_parts(part, num_parts)
+    return PartPairs(pairs.sample[rows], part, pairs.face[rows], pairs.bary[rows], counts)
 
 
 class AvatarModel(torch.nn.Module):
@@ -220,14 +220,13 @@ class AvatarModel(torch.nn.Module):
         with stage("union"):
             union = union_by_density(sigma, pairs.sample, pairs.part, total, self.num_parts)
         with stage("colour"):
-            rows = union.winner if skip.colors else torch.arange(len(sigma))
+            rows = union.winner if skip.colors else torch.arange(len(sigma), device=sigma.device)
             counted = union.counts if skip.colors else pairs.counts
             # index_select: the gradient of [] adds up in an order that changes with two threads
             code = None if frames.code is None else frames.code.index_select(0, owner[rows])
             rgb = self.field.color(encoded[rows], geometry[rows], code, counted)
             shown = rgb if skip.colors else rgb[union.winner]
-            color = torch.zeros(total, 3).to(rgb)
-            color = color.index_copy(0, pairs.sample[union.winner], shown)
+            color = rgb.new_zeros(total, 3).index_copy(0, pairs.sample[union.winner], shown)
         counts = {
             "samples_evaluated": total,
             "pairs_found": found,

@@ -122,8 +122,8 @@ def _render_view(
     prune = prune if skip.cells else 0.0
     index, rays, looked_at = shell_pixels(view.camera, scene, 0, skip)
     bodies = partly_skipping(scene.parts, skip)
-    color = torch.zeros(height * width, 3)
-    opacity, depth = torch.zeros(2, height * width).unbind(0)
+    color = rays.directions.new_zeros(height * width, 3)
+    opacity, depth = rays.directions.new_zeros(2, height * width).unbind(0)
     # Every count is there, also where no ray hits the shell.
     stats: Counter[str] = Counter({"pixels": height * width, **dict.fromkeys(STATS, 0)})
     stats["rays_box"] = looked_at

@@ -65,7 +65,9 @@ def load_state(trainer: "Trainer", run: Path) -> None:
 def _restore(trainer: "Trainer", tensors: dict[str, Tensor]) -> None:
     model = {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
     trainer.avatar.model.load_state_dict(model)
-    trainer.average = [tensors[f"average.{i}"] for i in range(len(trainer.average))]
+    trainer.average = [
+        tensors[f"average.{i}"].to(now.device) for i, now in enumerate(trainer.average)
+    ]
     trainer.generator.set_state(tensors["generator"])
     moments: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():

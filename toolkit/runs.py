@@ -15,6 +15,7 @@ from .captures import read_capture
 from .captures.records import CaptureRecord
 from .checkpoint import WEIGHTS, load_weights
 from .config import Config, from_json, to_json
+from .device import CPU
 from .environment import environment_facts
 
 
@@ -103,16 +104,18 @@ def create_run(out: Path, config: Config, record: CaptureRecord) -> Path:
         raise InputError(f"--out {out}: cannot make the folder ({error.strerror})") from None
     write_text(out / "config.json", to_json(config))
     write_json(out / "capture.json", {"path": str(record.root.resolve()), "params": record.params})
-    write_json(out / "environment.json", environment_facts())
+    device = str(record.body.v_template.device)
+    write_json(out / "environment.json", environment_facts() | {"device": device})
     return out
 
 
-def open_run(run: Path, capture: Path | None = None) -> Avatar:
+def open_run(run: Path, capture: Path | None = None, device: torch.device = CPU) -> Avatar:
     """The trained avatar of a run folder.
 
     Args:
         run: folder that ``monopart train`` made.
         capture: the capture if it has moved.
+        device: where it renders.
 
     Returns:
         The avatar, ready to render.
@@ -147,7 +150,7 @@ def open_run(run: Path, capture: Path | None = None) -> Avatar:
         raise InputError(
             f"{capture}: expected the capture of {run}, found nothing; name it by --capture"
         )
-    record = read_capture(capture, params=params)
+    record = read_capture(capture, params=params).to(device)
     torch.manual_seed(config.seed)
     avatar = Avatar.create(record, config, user_cache())
     load_weights(avatar.model, run)

@@ -113,7 +113,9 @@ def shell_pixels(
     """
     height, width = camera.size
     x0, y0, x1, y1 = _screen_box(camera, scene, body) if skip.box else (0, 0, width, height)
-    ys, xs = torch.meshgrid(torch.arange(y0, y1), torch.arange(x0, x1), indexing="ij")
+    device = scene.parts.device
+    sides = torch.arange(y0, y1, device=device), torch.arange(x0, x1, device=device)
+    ys, xs = torch.meshgrid(*sides, indexing="ij")
     pixels = torch.stack([xs, ys], -1).reshape(-1, 2).float() + 0.5
     rays = scene.local_rays(camera.rays(pixels), body)
     index, origins = (ys * width + xs).reshape(-1), rays.origins.expand_as(rays.directions)
@@ -135,5 +137,6 @@ def _screen_box(camera: Camera, scene: SceneBodies, body: int) -> tuple[int, int
     if bool((depth < 0.1).any()) or len(camera.distortion):
         return 0, 0, width, height
     low, high = pixels.amin(0).floor().long() - 1, pixels.amax(0).ceil().long() + 1
-    x0, y0 = (int(v) for v in low.clamp(min=0))
-    return x0, y0, max(x0, min(int(high[0]), width)), max(y0, min(int(high[1]), height))
+    left, top, right, bottom = torch.cat([low, high]).tolist()
+    x0, y0 = max(left, 0), max(top, 0)
+    return x0, y0, max(x0, min(right, width)), max(y0, min(bottom, height))

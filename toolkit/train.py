@@ -22,6 +22,7 @@ from .captures.cache import Pictures, read_pictures
 from .captures.patches import PixelBatch, PixelSampler
 from .checkpoint import save_weights
 from .determinism import repeatable
+from .device import sent
 from .losses import color_loss, offset_loss, round_trip_distance
 from .lpips import LPIPS, load_lpips
 from .model import Rendered
@@ -81,7 +82,9 @@ class Trainer:
         self.scene = avatar.scene(train.frames)
         self.body_of_image = torch.tensor([train.frames.index(f) for _, f in train.pairs()])
         self.camera_of_image = torch.tensor([train.cameras.index(c) for c, _ in train.pairs()])
-        self.train_cameras = [avatar.record.cameras[c] for c in train.cameras]
+        host = torch.zeros(())
+        # The host draws batches, and so the same ones for every device; see `sent`.
+        self.train_cameras = [avatar.record.cameras[c].to(host) for c in train.cameras]
         self.canonical = avatar.canonical_parts() if self.config.loss.consistency else None
         self.generator = torch.Generator().manual_seed(self.config.seed)
         self.result = TrainResult()
@@ -113,7 +116,9 @@ class Trainer:
             world = cam.rays(batch.pixels[rows])
             origins[rows] = world.origins.expand_as(world.directions)
             directions[rows] = world.directions
-        return self.scene.local_rays(Rays(origins, directions), body), body
+        body = sent(body, self.avatar.device)
+        world = Rays(sent(origins, self.avatar.device), sent(directions, self.avatar.device))
+        return self.scene.local_rays(world, body), body
 
     def warm_up(self) -> None:
         """Compile the kernels by one small step that changes nothing: the clock starts later."""
@@ -129,7 +134,7 @@ class Trainer:
     def _render(self, batch: PixelBatch, step: int) -> Rendered:
         with stage("rays"):
             rays, body = self.rays(batch)
-            jitter = torch.rand(len(body), generator=self.generator)
+            jitter = sent(torch.rand(len(body), generator=self.generator), self.avatar.device)
         return self.avatar.model.render_rays(
             self.scene.parts,
             self.avatar.training_input(),
@@ -172,8 +177,8 @@ class Trainer:
         if loop.random_background:
             ground = torch.rand(3, generator=self.generator)
         with stage("loss: colour"):
-            color = out.color + (1.0 - out.opacity)[:, None] * ground
-            target = batch.color + (~batch.mask)[:, None] * ground
+            target = sent(batch.color + (~batch.mask)[:, None] * ground, self.avatar.device)
+            color = out.color + (1.0 - out.opacity)[:, None] * sent(ground, self.avatar.device)
             terms = {"mse": spec.mse * color_loss(color, target)}
         if patch is not None and self.lpips is not None:
             height = min(loop.patch, self.sampler.height)
@@ -203,7 +208,7 @@ class Trainer:
                     self.canonical,
                     self.avatar.training_input(),
                     out,
-                    rows,
+                    sent(rows, self.avatar.device),
                 )
                 terms["consistency"] = spec.consistency * consistency_loss(
                     distance, spec.consistency_threshold
@@ -221,27 +226,28 @@ class Trainer:
             group["lr"] = group["base_lr"] * self.config.train.lr_final**done
         terms, out = self.losses(step, done)
         self.result.stats.update(out.stats)
-        total = torch.stack(list(terms.values())).sum()
+        values = torch.stack(list(terms.values()))
+        numbers = dict(zip(terms, values.tolist(), strict=True))  # one wait for the device
         self.optimizer.zero_grad(set_to_none=True)
-        if not math.isfinite(float(total.detach())):
-            self._bad_step(terms)
+        if not all(map(math.isfinite, numbers.values())):
+            self._bad_step(numbers)
             return self.last
         self.bad_steps = 0
         with stage("backward"):
-            total.backward()
+            values.sum().backward()
         with stage("optimiser"):
             self.optimizer.step()
         with stage("average of the weights"):
             self._average(step)
-        self.last = {name: float(term.detach()) for name, term in terms.items()}
+        self.last = numbers
         mse = self.last["mse"] / (self.config.loss.mse or 1.0)
         self.last["psnr"] = -10.0 * math.log10(max(mse, 1e-12))
         return self.last
 
-    def _bad_step(self, terms: dict[str, Tensor]) -> None:
+    def _bad_step(self, numbers: dict[str, float]) -> None:
         """Skip a step whose loss is not finite; end the run when that keeps happening."""
         self.bad_steps += 1
-        named = ", ".join(n for n, t in terms.items() if not math.isfinite(float(t.detach())))
+        named = ", ".join(n for n, value in numbers.items() if not math.isfinite(value))
         if self.bad_steps >= MAX_BAD_STEPS:
             raise MonopartError(
                 f"training: the terms {named} were not finite in {MAX_BAD_STEPS} steps in a row; "

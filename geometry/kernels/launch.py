@@ -3,7 +3,9 @@
 A Warp kernel runs on one thread on the CPU and releases the GIL, so a launch over ``count`` items
 is cut into chunks for a small pool. Kernels that are launched here take ``start: int`` as their
 first argument and work on item ``start + wp.tid()``. On CUDA one launch goes to torch's current
-stream, with no host synchronisation.
+stream, with no host synchronisation and no memory of Warp's own, so that launches can be captured
+in a CUDA graph of torch's. The first launch of a kernel loads its module: it belongs before the
+capture.
 """
 
 import functools
@@ -152,11 +154,18 @@ def launch_jobs(kernel: Any, jobs: list[list[Any]], count: int, like: Tensor) ->
     _run_side_by_side(kernel, [(count, [0, *args]) for args in jobs])
 
 
+@functools.lru_cache(maxsize=64)
+def _warp_stream(device: int, handle: int) -> Any:
+    """Warp's name for a stream of torch's, which owns it; made once, also for captures."""
+    return wp.Stream(f"cuda:{device}", cuda_stream=handle)
+
+
 def launch_one(kernel: Any, count: int, args: list[Any], like: Tensor) -> None:
     """Run one unsplit launch (a scatter kernel on one thread, or anything on CUDA)."""
     if like.device.type == "cuda":
-        stream = wp.stream_from_torch(torch.cuda.current_stream(like.device))
+        now = torch.cuda.current_stream(like.device)
+        stream = _warp_stream(now.device_index, now.cuda_stream)
         with stage(kernel.key, "kernel"):
-            wp.launch(kernel, dim=count, inputs=[0, *args], stream=stream)
+            wp.launch(kernel, dim=count, inputs=[0, *args], stream=stream, record_tape=False)
     else:
         _launch_on_cpu(kernel, count, [0, *args])

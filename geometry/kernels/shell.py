@@ -31,17 +31,22 @@ def splat_bodies(
     offset: wp.array(dtype=wp.int64),
     voxel: float,
     grid: wp.array(dtype=wp.int32),
+    share: int,
 ):
     """Set the part bits of every voxel whose centre lies within ``reach`` of a vertex.
 
-    One thread per body, so that no two threads write to the same voxel.
+    An item is ``share`` vertices of a body. On the CPU, where ``atomic_or`` is a plain one, that
+    must be all of them, so that no two threads write to the same voxel.
     """
-    b = start + wp.tid()
+    i = start + wp.tid()
+    items = (verts.shape[1] + share - 1) // share
+    b = i // items
+    first = (i % items) * share
     base = offset[b]
     n = dims[b]
     origin = lo[b]
     inverse = 1.0 / voxel
-    for v in range(verts.shape[1]):
+    for v in range(first, wp.min(first + share, verts.shape[1])):
         p = (verts[b, v] - origin) * inverse - wp.vec3(0.5, 0.5, 0.5)
         r = reach[v] * inverse
         bits = vertex_mask[v]
@@ -61,8 +66,7 @@ def splat_bodies(
                     x1 = wp.min(int(wp.floor(p[0] + rx)), n[0] - 1)
                     row = base + wp.int64((z * n[1] + y) * n[0])
                     for x in range(x0, x1 + 1):
-                        j = row + wp.int64(x)
-                        grid[j] = grid[j] | bits
+                        wp.atomic_or(grid, int(row) + x, bits)
 
 
 @no_type_check

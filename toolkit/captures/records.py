@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -94,6 +94,23 @@ class CaptureRecord:
         default_factory=dict, repr=False
     )
     _maps: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
+
+    def to(self, device: torch.device) -> "CaptureRecord":
+        """The same capture with body, poses and cameras on a device; images stay on the CPU.
+
+        Args:
+            device: where bodies are posed and rays made.
+
+        Returns:
+            The capture; it shares the images that are in memory.
+        """
+        like = torch.zeros((), device=device)
+        return replace(
+            self,
+            body=self.body.to(like),
+            poses={frame: pose.to(like) for frame, pose in self.poses.items()},
+            cameras=[camera.to(like) for camera in self.cameras],
+        )
 
     def split(self, name: str) -> Split:
         """A split by name.

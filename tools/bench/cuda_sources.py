@@ -1,7 +1,8 @@
 """``monopart-bench cuda-sources``: compile every kernel for CUDA, where no GPU is needed.
 
 Warp brings NVIDIA's run-time compiler, which needs no driver: the kernels that the CPU tests run
-are translated to CUDA and compiled to PTX. That proves that they compile, not that they run.
+are translated to CUDA, compiled to PTX and assembled. That proves that they compile, not that they
+run.
 """
 
 import ast
@@ -16,14 +17,16 @@ from typing import Any
 
 from monopart.geometry.errors import BackendError
 
+from .cubin import KernelFacts, kernel_facts
+
 PACKAGES = ("monopart.geometry.kernels", "monopart.fields.kernels")
 FACTORIES: dict[str, tuple[tuple[Any, ...], ...]] = {
     "forward_kernel": ((1,), (2,), (4,)),
     "points_kernel": ((1,), (2,), (4,)),
     "table_kernel": ((1,), (2,), (4,)),
-    "row_adam_kernel": ((1,), (2,), (4,)),
+    "row_adam_kernel": ((1,), (2,), (3,), (4,)),
 }
-"""Functions that make kernels, with the arguments that are used on CUDA."""
+"""Functions that make kernels, with all arguments that they serve."""
 LEAST_ARCH = 75  # Turing: PTX for it runs on every later GPU
 
 
@@ -37,6 +40,8 @@ class Compiled:
     """Compute capability, such as 80."""
     ptx_bytes: int
     """Size of the PTX of its module."""
+    facts: KernelFacts
+    """Registers and stack, as assembled for this architecture."""
 
 
 def kernels() -> dict[str, Any]:
@@ -86,44 +91,59 @@ def _is_kernel(function: ast.FunctionDef) -> bool:
 
 def has_compiler() -> bool:
     """Whether this build of Warp brings the CUDA compiler."""
+    return bool(known_archs())
+
+
+def known_archs() -> list[int]:
+    """Compute capabilities that this build of Warp compiles for; none without a compiler."""
+    import warp as wp
+
     from monopart.geometry.kernels.launch import init
 
     init()
-    runtime = importlib.import_module("warp._src.context").runtime
-    return bool(getattr(runtime, "is_cuda_enabled", False))
+    return wp.get_cuda_supported_archs()
 
 
 def compile_all(arch: int = LEAST_ARCH) -> list[Compiled]:
-    """Compile all kernels to PTX.
+    """Compile all kernels to PTX and assemble it.
 
     Args:
         arch: compute capability.
 
     Returns:
-        One entry per kernel whose entry point is in the PTX.
+        One entry per kernel whose entry point is in the PTX and in the program.
 
     Raises:
-        BackendError: a kernel is missing from the PTX of its module.
+        BackendError: an architecture that the compiler does not know, or a kernel that is missing
+            from what was compiled of its module.
     """
     import warp as wp
 
     from monopart.geometry.kernels.launch import init
 
     init()
+    if arch not in known_archs():
+        raise BackendError(
+            f"--arch {arch}: expected one of {', '.join(map(str, known_archs()))}; choose one"
+        )
     named = kernels()
     modules = {id(kernel.module): kernel.module for kernel in named.values()}
     text: dict[int, str] = {}
+    facts: dict[str, KernelFacts] = {}
     with tempfile.TemporaryDirectory() as folder:
         for number, (key, module) in enumerate(modules.items()):
             out = Path(folder) / str(number)
             wp.compile_aot_module(module, arch=arch, module_dir=out, use_ptx=True)
             text[key] = "\n".join(p.read_text() for p in sorted(out.glob("*.ptx")))
+            wp.compile_aot_module(module, arch=arch, module_dir=out, use_ptx=False)
+            for program in out.glob("*.cubin"):
+                facts |= kernel_facts(program.read_bytes())
     compiled = []
     for name, kernel in named.items():
-        ptx = text[id(kernel.module)]
-        if f".entry {kernel.get_mangled_name()}_cuda_kernel_forward" not in ptx:
-            raise BackendError(f"{name}: expected its entry point in the PTX for sm_{arch}")
-        compiled.append(Compiled(name, arch, len(ptx)))
+        ptx, entry = text[id(kernel.module)], f"{kernel.get_mangled_name()}_cuda_kernel_forward"
+        if f".entry {entry}" not in ptx or entry not in facts:
+            raise BackendError(f"{name}: expected its entry point in what compiled for sm_{arch}")
+        compiled.append(Compiled(name, arch, len(ptx), facts[entry]))
     return compiled
 
 
@@ -142,12 +162,16 @@ def print_compiled(archs: tuple[int, ...]) -> None:
     if not has_compiler():
         raise BackendError("cuda-sources: this build of Warp has no CUDA compiler; use Linux")
     table = Table(title="Kernels compiled for CUDA (no GPU ran them)")
-    for column in ("kernel", *(f"sm_{arch}, kB of PTX of its module" for arch in archs)):
-        table.add_column(column)
-    sizes: dict[str, list[str]] = {}
+    table.add_column("kernel", no_wrap=True)
+    for arch in archs:
+        table.add_column(f"sm_{arch}", justify="right", no_wrap=True)
+    cells: dict[str, list[str]] = {}
     for arch in archs:
         for entry in compile_all(arch):
-            sizes.setdefault(entry.name, []).append(f"{entry.ptx_bytes / 1000:.0f}")
-    for name, row in sizes.items():
-        table.add_row(name.removeprefix("monopart."), *row)
+            size, needs = entry.ptx_bytes / 1000, entry.facts
+            row = cells.setdefault(entry.name, [])
+            row.append(f"{size:.0f}  {needs.registers:>3}  {needs.stack:>4}")
+    for name, row in cells.items():
+        table.add_row(name.removeprefix("monopart.").replace(".kernels.", "."), *row)
+    table.caption = "kB of PTX of the kernel's module; registers and bytes of stack per thread"
     Console(width=120).print(table)
