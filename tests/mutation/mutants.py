@@ -240,8 +240,8 @@ FIELDS = (
         "equal densities go to the last part",
         "wrong threshold side",
         "fields/part_union.py",
-        "better = table[k] > value",
-        "better = table[k] >= value",
+        "better = ~(table[k] <= value)",
+        "better = ~(table[k] < value)",
         _fields("part_union"),
     ),
     Mutant(
