@@ -18,7 +18,7 @@ from torch import Tensor
 
 from .body import BodyModel
 from .skinning_field import SkinningField
-from .unskin_newton import Bones, Plan, Roots, by_voxel, run_solver
+from .unskin_newton import Bones, Plan, Roots, SolverOutput, by_voxel, limits_of
 from .weight_grid import diffuse_weights
 
 _VOXEL, _REACH = 0.015, 0.1
@@ -185,7 +185,7 @@ def newton_cells(
         The roots (their faces are cells), and their weights [N, J].
     """
     from .kernels.diffused import solve_cells
-    from .kernels.launch import view
+    from .kernels.launch import launch, view
 
     grid = field.grid
     points, maps, guess = points.contiguous(), maps.contiguous(), guess.contiguous()
@@ -193,4 +193,7 @@ def newton_cells(
     args += [grid.lo, grid.size, grid.voxel, view(grid.slots), view(grid.cells)]
     args += [view(grid.distance), view(maps, 4), view(grid.weights), view(bones.joints, 3)]
     args += [view(bones.inverses, 4)]
-    return run_solver(solve_cells, args, points, plan, grid.weights.shape[1])
+    search = [plan.starts, plan.iterations, int(plan.gradients), limits_of(plan)]
+    out = SolverOutput.of(points, grid.weights.shape[1])
+    launch(solve_cells, len(points), [*args, *search, *out.views()], points)
+    return out.roots(), out.weights

@@ -19,7 +19,7 @@ from .errors import InputError
 from .rigid import append_last_row, apply_linear, invert_linear
 from .skinning import blend_transforms, unskin
 from .skinning_field import SkinningField, vertex_maps
-from .unskin_broyden import broyden
+from .unskin_broyden import broyden_starts, rescued
 from .unskin_newton import (
     ARRIVED,
     MIN_DET,
@@ -27,14 +27,13 @@ from .unskin_newton import (
     Plan,
     Roots,
     guess_warp,
-    keep_better,
     newton_torch,
     newton_warp,
-    nowhere,
 )
 
 _ITERATIONS = {"nearest": 0, "surface": 0, "fixed_point": 5, "broyden": 20, "newton": 8}
 _STARTS = {"nearest": 1, "surface": 1, "fixed_point": 1, "broyden": 1, "newton": 6}
+_STOP, _STOP_TANGENTS = 5e-6, 4e-7  # metres, float32: Newton's last step is nearly free
 _PAIRS = 1 << 24  # (point, vertex) pairs of one step of the nearest-vertex search
 _FIELDS: "weakref.WeakKeyDictionary[BodyModel, SkinningField]" = weakref.WeakKeyDictionary()
 
@@ -79,7 +78,8 @@ def inverse_skin(
         method: "nearest" (weights of the nearest posed vertex), "surface" (weights of the closest
             posed surface point), "fixed_point" (surface, then the weights are looked up again at
             the rest point), "broyden" (quasi-Newton in batched torch) or "newton" (voxel look-up of
-            a first guess, then Newton steps with the analytic Jacobian, one kernel for all).
+            a first guess, then Newton steps with the analytic Jacobian, one kernel for all; what
+            did not arrive goes through Broyden's method, but for a `DiffusedField`).
         rest_verts: shaped rest vertices ``body.shaped(betas)[0]``, or a `SkinningField` that holds
             them and names a back end; None is the mean shape, ``body.v_template``. The search
             structures of the last shape of a body are kept. A `DiffusedField` takes weights from a
@@ -111,6 +111,8 @@ def inverse_skin(
     """
     plan = plan_of(method, max_distance, starts, iterations, points.dtype)
     query = prepare(points, posed, body, rest_verts)
+    if isinstance(query.field, DiffusedField):
+        plan = replace(plan, rescues=0)  # its weights have no kinks to cross
     found = (_direct if method in ("nearest", "surface") else _iterative)(query, method, plan)
     return Unskinned(
         found.points,
@@ -210,8 +212,10 @@ def plan_of(
             raise InputError(f"{name}: expected at least {least}, found {value}; or pass None")
     if not max_distance > 0:
         raise InputError(f"max_distance: expected metres > 0, found {max_distance}; use 0.2")
-    stop = 5e-6 if dtype == torch.float32 else 1e-10
-    return Plan(iterations, starts, max_distance, stop, method == "newton")
+    tangents = method == "newton"
+    stop = 1e-10 if dtype != torch.float32 else _STOP_TANGENTS if tangents else _STOP
+    rescues = starts if tangents and iterations else 0
+    return Plan(iterations, starts, max_distance, stop, tangents, rescues)
 
 
 def _field(
@@ -376,12 +380,9 @@ def surface_guess(query: Query) -> Float[Tensor, "n 3"]:
 
 def _search(method: str, query: Query, maps: Tensor, bones: Bones, plan: Plan) -> Roots:
     guess, points = surface_guess(query), query.points.detach()
-    if method != "broyden":
-        if query.fast:
-            return solve(query, maps, bones, plan, guess.contiguous())[0]
-        return newton_torch(query.field, points, maps, bones, plan, guess)
-    best = nowhere(guess)
-    for start in range(min(plan.starts, bones.joints.shape[0] + 1)):
-        first = guess if start == 0 else bones.guess(points, start - 1)
-        best = keep_better(best, broyden(query.field, points, maps, plan, first))
-    return best
+    if method == "broyden":
+        return broyden_starts(query.field, points, maps, bones, plan, guess)
+    if query.fast:
+        return solve(query, maps, bones, plan, guess.contiguous())[0]
+    found = newton_torch(query.field, points, maps, bones, plan, guess)
+    return rescued(found, query.field, points, maps, bones, plan, guess)

@@ -1,6 +1,7 @@
 """Broyden's method on the forward skinning field, in batched torch: the classical choice."""
 
 import math
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -8,7 +9,7 @@ from torch import Tensor
 
 from .rigid import apply_linear, invert_linear
 from .skinning_field import SkinningField
-from .unskin_newton import MIN_DET, Plan, Roots, nowhere
+from .unskin_newton import ARRIVED, MIN_DET, Bones, Plan, Roots, keep_better, nowhere
 
 
 def broyden(
@@ -55,6 +56,65 @@ def broyden(
         move = move * (0.2 / move.norm(dim=-1, keepdim=True).clamp(min=0.2))
         rest = rest[go] + move
     return best
+
+
+def broyden_starts(
+    field: SkinningField,
+    points: Float[Tensor, "n 3"],
+    maps: Float[Tensor, "m 3 4"],
+    bones: Bones,
+    plan: Plan,
+    guess: Float[Tensor, "n 3"],
+) -> Roots:
+    """Broyden's method from several starts: every point takes the best.
+
+    Args:
+        field: the forward field.
+        points: targets in pose space, finite.
+        maps: ``field.maps`` of the pose.
+        bones: for the starts after the first.
+        plan: how to search.
+        guess: first rest points.
+
+    Returns:
+        The roots.
+    """
+    best = nowhere(guess)
+    for start in range(min(plan.starts, bones.joints.shape[0] + 1)):
+        first = guess if start == 0 else bones.guess(points, start - 1)
+        best = keep_better(best, broyden(field, points, maps, plan, first))
+    return best
+
+
+def rescued(
+    found: Roots,
+    field: SkinningField,
+    points: Float[Tensor, "n 3"],
+    maps: Float[Tensor, "m 3 4"],
+    bones: Bones,
+    plan: Plan,
+    guess: Float[Tensor, "n 3"],
+) -> Roots:
+    """Newton's roots, and Broyden's where Newton's did not arrive: twin of `kernels.broyden`.
+
+    Args:
+        found: where Newton's method ended.
+        field: the forward field.
+        points: targets in pose space, finite.
+        maps: ``field.maps`` of the pose.
+        bones: for the starts after the first.
+        plan: how to search; without rescues nothing is done.
+        guess: first rest points.
+
+    Returns:
+        The roots.
+    """
+    rows = (found.residual > ARRIVED).nonzero().squeeze(-1)
+    if not plan.rescues or not len(rows):
+        return found
+    plan = replace(plan, starts=plan.rescues, iterations=plan.rescue_iterations)
+    more = broyden_starts(field, points[rows], maps, bones, plan, guess[rows])
+    return keep_better(found, more.spread(rows, found))
 
 
 def _rank_one(inverse: Tensor, move: Tensor, change: Tensor) -> Tensor:

@@ -35,6 +35,24 @@ class Roots:
     residual: Float[Tensor, "n"]
     invertible: Bool[Tensor, "n"]
 
+    def spread(self, rows: Int[Tensor, "m"], among: "Roots") -> "Roots":
+        """These roots at some rows of others; elsewhere nothing.
+
+        Args:
+            rows: a row of each of these roots.
+            among: gives the number of rows.
+
+        Returns:
+            Roots as many as ``among``.
+        """
+        rest = nowhere(among.points)
+        return Roots(
+            rest.points.index_copy(0, rows, self.points),
+            rest.face.index_copy(0, rows, self.face),
+            rest.residual.index_copy(0, rows, self.residual),
+            rest.invertible.index_copy(0, rows, self.invertible),
+        )
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -46,6 +64,7 @@ class Plan:
         max_distance: reach of the rest surface, metres.
         stop: residual that ends the iterations of a point, metres.
         gradients: Newton's Jacobian; False only re-queries the weights.
+        rescues: starts of Broyden's method for the points that did not arrive.
     """
 
     iterations: int
@@ -53,6 +72,12 @@ class Plan:
     max_distance: float
     stop: float
     gradients: bool
+    rescues: int = 0
+
+    @property
+    def rescue_iterations(self) -> int:
+        """Steps of one start of a rescue: secants need more of them than tangents."""
+        return 5 * self.iterations // 2
 
 
 @dataclass(frozen=True)
@@ -140,6 +165,54 @@ def by_voxel(points: Float[Tensor, "n 3"], rest: Float[Tensor, "V 3"]) -> Int[Te
     return ((cell[:, 2] * _ORDER + cell[:, 1]) * _ORDER + cell[:, 0]).argsort()
 
 
+@dataclass(frozen=True)
+class SolverOutput:
+    """What the kernels that solve every point write.
+
+    Attributes:
+        rest: [N, 3] rest points, metres.
+        weights: [N, J] skinning weights.
+        place: [N] int32 faces or cells, -1: none.
+        residual: [N] metres.
+        invertible: [N] whether the map has an inverse.
+    """
+
+    rest: Float[Tensor, "n 3"]
+    weights: Float[Tensor, "n J"]
+    place: Int[Tensor, "n"]
+    residual: Float[Tensor, "n"]
+    invertible: Bool[Tensor, "n"]
+
+    @classmethod
+    def of(cls, points: Float[Tensor, "n 3"], joints: int) -> "SolverOutput":
+        """Room for the results of some targets."""
+        count, device = len(points), points.device
+        return cls(
+            torch.empty_like(points),
+            torch.empty(count, joints, device=device),
+            torch.empty(count, dtype=torch.int32, device=device),
+            torch.empty(count, device=device),
+            torch.empty(count, dtype=torch.bool, device=device),
+        )
+
+    def views(self) -> list[Any]:
+        """Launch arguments, in the order of the attributes."""
+        from .kernels.launch import view
+
+        mask = [view(self.place), view(self.residual), view(self.invertible)]
+        return [view(self.rest, 3), view(self.weights), *mask]
+
+    def roots(self) -> Roots:
+        """The roots, after the launches."""
+        residual = torch.where(self.place >= 0, self.residual, math.inf)
+        return Roots(self.rest, self.place.clamp(min=0).long(), residual, self.invertible)
+
+
+def limits_of(plan: Plan) -> tuple[float, float, float, float]:
+    """Limits of a kernel that solves: see `kernels.newton.solve`."""
+    return plan.stop, ARRIVED, MIN_DET, min(plan.max_distance, LIMIT)
+
+
 def newton_warp(
     field: SkinningField,
     points: Float[Tensor, "n 3"],
@@ -161,7 +234,8 @@ def newton_warp(
     Returns:
         The roots, and their weights [N, J].
     """
-    from .kernels.launch import view
+    from .kernels.broyden import rescue
+    from .kernels.launch import launch, view
     from .kernels.newton import solve
 
     points, maps = points.contiguous(), maps.contiguous()
@@ -169,44 +243,18 @@ def newton_warp(
         guess, hint = guess_warp(field, points, maps, plan.max_distance)
     else:
         hint = torch.full((len(points),), -1, dtype=torch.int32, device=points.device)
-    order = by_voxel(guess, field.rest)
-    args = [view(order), view(points, 3), view(guess, 3), view(hint)]
-    args += [view(field.index.tree.places), *field.index.tree.args()]
-    args += [view(field.rest.detach().contiguous(), 3), view(field.index.tree.corners, 3)]
-    args += [view(maps, 4), view(field.weights32), view(bones.joints, 3), view(bones.inverses, 4)]
-    return run_solver(solve, args, points, plan, field.weights.shape[1])
-
-
-def run_solver(
-    kernel: Any, args: list[Any], points: Float[Tensor, "n 3"], plan: Plan, joints: int
-) -> tuple[Roots, Float[Tensor, "n J"]]:
-    """Launch a kernel that solves every point: limits and results are the same for all fields.
-
-    Args:
-        kernel: takes ``args``, then starts, iterations, gradients and limits of the plan, then rest
-            points, weights, faces or cells (-1: none), residuals and invertibility to write.
-        args: launch arguments of the field.
-        points: targets.
-        plan: how to search.
-        joints: columns of the weights.
-
-    Returns:
-        The roots, and their weights [N, J].
-    """
-    from .kernels.launch import launch, view
-
-    count, device = len(points), points.device
-    rest = torch.empty_like(points)
-    weights = torch.empty(count, joints, device=device)
-    place = torch.empty(count, dtype=torch.int32, device=device)
-    residual = torch.empty(count, device=device)
-    invertible = torch.empty(count, dtype=torch.bool, device=device)
-    limits = (plan.stop, ARRIVED, MIN_DET, min(plan.max_distance, LIMIT))
-    search = [plan.starts, plan.iterations, int(plan.gradients), limits]
-    out = [view(rest, 3), view(weights), view(place), view(residual), view(invertible)]
-    launch(kernel, count, [*args, *search, *out], points)
-    residual = torch.where(place >= 0, residual, math.inf)
-    return Roots(rest, place.clamp(min=0).long(), residual, invertible), weights
+    tree, rest = field.index.tree, field.rest.detach().contiguous()
+    to = [view(points, 3), view(guess, 3)]
+    on = [*tree.args(), view(rest, 3), view(tree.corners, 3), view(maps, 4)]
+    on += [view(field.weights32), view(bones.joints, 3), view(bones.inverses, 4)]
+    out = SolverOutput.of(points, field.weights.shape[1])
+    search = [plan.starts, plan.iterations, int(plan.gradients), limits_of(plan)]
+    first = [view(by_voxel(guess, field.rest)), *to, view(hint), view(tree.places)]
+    launch(solve, len(points), [*first, *on, *search, *out.views()], points)
+    if plan.rescues:
+        search = [plan.rescues, plan.rescue_iterations, limits_of(plan)]
+        launch(rescue, len(points), [*to, *on, *search, *out.views()], points)
+    return out.roots(), out.weights
 
 
 def newton_torch(
@@ -235,7 +283,7 @@ def newton_torch(
         todo = (best.residual > ARRIVED).nonzero().squeeze(-1)
         first = guess if start == 0 else bones.guess(points, start - 1)
         found = _descend(field, points[todo], maps, plan, first[todo])
-        best = keep_better(best, _spread(found, todo, best))
+        best = keep_better(best, found.spread(todo, best))
     return best
 
 
@@ -278,17 +326,6 @@ def nowhere(guess: Float[Tensor, "n 3"]) -> Roots:
     face = torch.zeros(len(guess), dtype=torch.long, device=guess.device)
     residual = torch.full((len(guess),), math.inf, dtype=guess.dtype, device=guess.device)
     return Roots(guess.clone(), face, residual, torch.zeros_like(face, dtype=torch.bool))
-
-
-def _spread(found: Roots, rows: Tensor, old: Roots) -> Roots:
-    """Roots of some rows among all rows, elsewhere nothing."""
-    all_rows = nowhere(old.points)
-    return Roots(
-        all_rows.points.index_copy(0, rows, found.points),
-        all_rows.face.index_copy(0, rows, found.face),
-        all_rows.residual.index_copy(0, rows, found.residual),
-        all_rows.invertible.index_copy(0, rows, found.invertible),
-    )
 
 
 def keep_better(old: Roots, new: Roots) -> Roots:

@@ -105,7 +105,7 @@ def inverse_skin_all(
 def _every_start(query: Query, maps: Tensor, plan: Plan) -> list[tuple[Roots, Tensor]]:
     """The root of each start, alone, and its weights."""
     bones, targets = query.bones(), query.points.detach()
-    alone = replace(plan, starts=1)
+    alone = replace(plan, starts=1, rescues=0)
     found = []
     for number in range(min(plan.starts, bones.joints.shape[0] + 1)):
         # the closest face itself: the voxel look-up of `inverse_skin` finds fewer roots in contacts

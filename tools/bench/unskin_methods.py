@@ -96,6 +96,7 @@ def unskin_methods() -> tuple[Method, ...]:
         Method("newton (default)", _method("newton"), ours=True, needs=one),
         Method("newton, 1 start", _method("newton", starts=1), ours=True, needs=many),
         Method("newton, 3 starts", _method("newton", starts=3), ours=True, needs=many),
+        Method(f"newton, {STARTS} starts", _method("newton", starts=STARTS), ours=True, needs=many),
         Method("broyden on Warp's query, 1 start", _method("broyden", plain=True), needs=many),
         Method(
             f"broyden on Warp's query, {STARTS} starts",
