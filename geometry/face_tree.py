@@ -26,7 +26,9 @@ class FaceTrees:
             `tris`, number of the first leaf (-1: no faces) and first entry in `slots`.
         slots: [S] int32 face of each place in a leaf, -1 where there is none.
         boxes: [R, 8] float32, six rows a node: lower x y z and upper x y z of its children.
-        tris: [T, 8] float32, nine rows a leaf: first corner and two edges of its faces.
+        tris: [T, 8] float32, 14 rows a leaf: first corner of its faces, unit vectors along the
+            first edge and across it, first edge and second corner in these, inverse squared
+            lengths of the other edges.
         corners: [F, 3] int32 vertex indices of the faces, for kernels.
 
     >>> verts = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])

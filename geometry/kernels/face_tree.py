@@ -15,48 +15,40 @@ wp.set_module_options({"enable_backward": False})  # the search is piecewise con
 FAR = 1e15  # coordinate of what is not there: its squared distance is finite and beyond any limit
 LANES = 8  # children of a node, faces of a leaf: one vector of 8 floats
 BOX_ROWS = 6  # rows of a node: lower x y z and upper x y z of the boxes of its children
-FACE_ROWS = 9  # rows of a leaf: x y z of the first corner and of the edges to the other two
+FACE_ROWS = 14  # rows of a leaf: see `FaceTrees.tris`
 LAYOUT = 6  # numbers that describe the tree of one group
 _FAR = wp.constant(FAR)
+_FACE_ROWS = wp.constant(FACE_ROWS)
 
-# Squared distances d[8] of a point p to the faces of a leaf t: the plane where its foot is inside,
-# else the nearest of three edges; faces without area have edges only. The plane's basis is made
-# orthogonal (b, and h = c - g b): determinants of a needle would cancel to nothing.
+# Squared distances d[8] of a point p to the faces of a leaf t, each in its own frame: x along the
+# first edge, y in the plane, z off it. An orthonormal frame turns, it does not stretch: a needle
+# keeps its digits, where determinants of its edges would cancel to nothing.
 _LEAF = """
     for (int k = 0; k < 8; k++) {
         const float px = p[0] - t[k], py = p[1] - t[8 + k], pz = p[2] - t[16 + k];
-        const float bx = t[24 + k], by = t[32 + k], bz = t[40 + k];
-        const float cx = t[48 + k], cy = t[56 + k], cz = t[64 + k];
-        const float bb = bx * bx + by * by + bz * bz;
-        const float cc = cx * cx + cy * cy + cz * cz;
-        const float over_bb = 1.0f / (bb > 1e-30f ? bb : 1e-30f);
-        const float g = (bx * cx + by * cy + bz * cz) * over_bb;
-        float s = (bx * px + by * py + bz * pz) * over_bb;
-        float u = (cx * px + cy * py + cz * pz) / (cc > 1e-30f ? cc : 1e-30f);
-        const float hx = cx - g * bx, hy = cy - g * by, hz = cz - g * bz;
-        float x = px - s * bx, y = py - s * by, z = pz - s * bz;
-        const float hh = hx * hx + hy * hy + hz * hz;
-        const float w = (hx * x + hy * y + hz * z) / (hh > 1e-30f ? hh : 1e-30f);
-        const float v = s - w * g;
-        x -= w * hx; y -= w * hy; z -= w * hz;
-        const float inside = x * x + y * y + z * z;
-        const float ex = cx - bx, ey = cy - by, ez = cz - bz;
-        const float qx = px - bx, qy = py - by, qz = pz - bz;
-        const float ee = ex * ex + ey * ey + ez * ez;
-        float q = (ex * qx + ey * qy + ez * qz) / (ee > 1e-30f ? ee : 1e-30f);
-        s = s < 0.0f ? 0.0f : (s > 1.0f ? 1.0f : s);
+        const float ux = t[24 + k], uy = t[32 + k], uz = t[40 + k];
+        const float vx = t[48 + k], vy = t[56 + k], vz = t[64 + k];
+        const float bx = t[72 + k], cx = t[80 + k], cy = t[88 + k];
+        const float x = ux * px + uy * py + uz * pz;
+        const float y = vx * px + vy * py + vz * pz;
+        const float z = (uy * vz - uz * vy) * px + (uz * vx - ux * vz) * py
+            + (ux * vy - uy * vx) * pz;
+        const float ex = cx - bx, qx = x - bx;
+        float s = x;
+        float u = (x * cx + y * cy) * t[96 + k];
+        float q = (qx * ex + y * cy) * t[104 + k];
+        s = s < 0.0f ? 0.0f : (s > bx ? bx : s);
         u = u < 0.0f ? 0.0f : (u > 1.0f ? 1.0f : u);
         q = q < 0.0f ? 0.0f : (q > 1.0f ? 1.0f : q);
-        x = px - s * bx; y = py - s * by; z = pz - s * bz;
-        const float on_b = x * x + y * y + z * z;
-        x = px - u * cx; y = py - u * cy; z = pz - u * cz;
-        const float on_c = x * x + y * y + z * z;
-        x = qx - q * ex; y = qy - q * ey; z = qz - q * ez;
-        const float on_a = x * x + y * y + z * z;
+        const float on_b = (x - s) * (x - s) + y * y;
+        const float cu = x - u * cx, cv = y - u * cy;
+        const float on_c = cu * cu + cv * cv;
+        const float au = qx - q * ex, av = y - q * cy;
+        const float on_a = au * au + av * av;
         float edge = on_b < on_c ? on_b : on_c;
         edge = edge < on_a ? edge : on_a;
-        const bool is_in = v >= 0.0f && w >= 0.0f && v + w <= 1.0f && hh > 1e-12f * cc;
-        d[k] = is_in ? inside : edge;
+        const bool is_in = y >= 0.0f && cy * x >= cx * y && ex * y >= cy * qx && cy > 0.0f;
+        d[k] = z * z + (is_in ? 0.0f : edge);
     }
 """
 
@@ -76,7 +68,7 @@ _SEARCH = """
     if (first_leaf < 0) return -1;
     for (;;) {
         if (node >= first_leaf) {
-            const float* t = tri + (long long)(node - first_leaf) * 72;
+            const float* t = tri + (long long)(node - first_leaf) * 112;
             LEAF
             for (int k = 0; k < 8; k++)
                 if (d[k] < best) { best = d[k]; slot = (node - first_leaf) * 8 + k; }
@@ -114,7 +106,7 @@ _SEARCH = """
 _SEARCH_LEAF = """
     const long long* at = layout.data;
     const int place = places.data[face];
-    const float* t = tris.data + 8 * at[2] + (long long)(place / 8) * 72;
+    const float* t = tris.data + 8 * at[2] + (long long)(place / 8) * 112;
     float d[8];
     LEAF
     int best = 0;
@@ -206,6 +198,32 @@ def put_box(
 
 
 @no_type_check
+@wp.func
+def frame_of(ab: wp.vec3, ac: wp.vec3):
+    """Unit vectors along the first edge and in the plane across it, and the height of the face.
+
+    A face without area has height 0 and any direction across.
+    """
+    u = wp.vec3(1.0, 0.0, 0.0)
+    if wp.length_sq(ab) > 0.0:
+        u = wp.normalize(ab)
+    elif wp.length_sq(ac) > 0.0:
+        u = wp.normalize(ac)
+    v = ac - wp.dot(u, ac) * u
+    v = v - wp.dot(u, v) * u
+    height = wp.length(v)
+    if height <= 1.0e-6 * wp.length(ac):
+        height = 0.0
+        v = wp.vec3(0.0, 1.0, 0.0)
+        if wp.abs(u[1]) > 0.7:
+            v = wp.vec3(0.0, 0.0, 1.0)
+        v = v - wp.dot(u, v) * u
+    v = wp.normalize(v)
+    v = wp.normalize(v - wp.dot(u, v) * u)  # across to the last digit, for needles
+    return u, v, height
+
+
+@no_type_check
 @wp.kernel
 def refit_leaves(
     start: int,
@@ -223,7 +241,7 @@ def refit_leaves(
     body = i // leaves
     leaf = i % leaves
     first_leaf = int(layout[group, 4])
-    row = int(layout[group, 2] + wp.int64(body) * layout[group, 3]) + leaf * 9
+    row = int(layout[group, 2] + wp.int64(body) * layout[group, 3]) + leaf * _FACE_ROWS
     slot = int(layout[group, 5]) + leaf * 8
     low = wp.vec3(_FAR, _FAR, _FAR)
     high = wp.vec3(-_FAR, -_FAR, -_FAR)
@@ -240,10 +258,16 @@ def refit_leaves(
             ac = c - a
             low = wp.min(low, wp.min(a, wp.min(b, c)))
             high = wp.max(high, wp.max(a, wp.max(b, c)))
+        u, v, height = frame_of(ab, ac)
+        along = wp.vec3(wp.dot(u, ab), wp.dot(u, ac), height)
         for axis in range(3):
             tris[row + axis, k] = a[axis]
-            tris[row + 3 + axis, k] = ab[axis]
-            tris[row + 6 + axis, k] = ac[axis]
+            tris[row + 3 + axis, k] = u[axis]
+            tris[row + 6 + axis, k] = v[axis]
+            tris[row + 9 + axis, k] = along[axis]
+        gap = along[1] - along[0]
+        tris[row + 12, k] = 1.0 / wp.max(along[1] * along[1] + height * height, 1.0e-30)
+        tris[row + 13, k] = 1.0 / wp.max(gap * gap + height * height, 1.0e-30)
     if first_leaf > 0:
         first = layout[group, 0] + wp.int64(body) * layout[group, 1]
         put_box(boxes, first, first_leaf + leaf, low, high)
