@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from monopart.geometry.cameras import Rays
-from monopart.geometry.consistency import consistency_loss
 from monopart.geometry.errors import MonopartError
 from monopart.geometry.stages import stage
 
@@ -23,9 +22,9 @@ from .captures.patches import PixelBatch, PixelSampler
 from .checkpoint import save_weights
 from .determinism import repeatable
 from .device import sent
-from .losses import color_loss, offset_loss, round_trip_distance
 from .lpips import LPIPS, load_lpips
 from .model import Rendered
+from .objective import Objective, Seen
 from .optimizer import make_optimizer
 from .resume import forget_state, save_state
 from .skipping import EVERY
@@ -85,7 +84,8 @@ class Trainer:
         host = torch.zeros(())
         # The host draws batches, and so the same ones for every device; see `sent`.
         self.train_cameras = [avatar.record.cameras[c].to(host) for c in train.cameras]
-        self.canonical = avatar.canonical_parts() if self.config.loss.consistency else None
+        canonical = avatar.canonical_parts() if self.config.loss.consistency else None
+        self.objective = Objective(self.config, canonical)
         self.generator = torch.Generator().manual_seed(self.config.seed)
         self.result = TrainResult()
         self.lpips = self._load_lpips()
@@ -165,7 +165,7 @@ class Trainer:
         Returns:
             Named terms whose sum is minimised, and the rendering.
         """
-        spec, loop = self.config.loss, self.config.train
+        loop = self.config.train
         with stage("batch"):
             batch = self.sampler.random(loop.rays, self.generator)
             with_patch = self.has_patch(step, done)
@@ -176,44 +176,21 @@ class Trainer:
         ground = torch.zeros(3)
         if loop.random_background:
             ground = torch.rand(3, generator=self.generator)
-        with stage("loss: colour"):
-            target = sent(batch.color + (~batch.mask)[:, None] * ground, self.avatar.device)
-            color = out.color + (1.0 - out.opacity)[:, None] * sent(ground, self.avatar.device)
-            terms = {"mse": spec.mse * color_loss(color, target)}
-        if patch is not None and self.lpips is not None:
+        target = sent(batch.color + (~batch.mask)[:, None] * ground, self.avatar.device)
+        color = out.color + (1.0 - out.opacity)[:, None] * sent(ground, self.avatar.device)
+        shape = None
+        if patch is not None:
             height = min(loop.patch, self.sampler.height)
-            shape = (1, height, -1, 3)
-            with stage("loss: LPIPS"):
-                seen, wanted = color[loop.rays :].reshape(shape), target[loop.rays :].reshape(shape)
-                terms["lpips"] = spec.lpips * self.lpips(seen.clamp(0, 1), wanted).mean()
+            shape = (height, len(patch.image) // height)
+        terms = self.objective.color(Seen(color, target, shape), self.lpips)
         terms.update(self._deformation_terms(out))
         return terms, out
 
     def _deformation_terms(self, out: Rendered) -> dict[str, Tensor]:
-        spec, terms = self.config.loss, {}
-        if out.shaded.residual is None:
-            return terms
-        if spec.offset:
-            with stage("loss: offset"):
-                terms["offset"] = spec.offset * offset_loss(out.shaded.residual)
-        if self.canonical is not None and self.avatar.model.forward_residual is not None:
-            count = len(out.shaded.pairs.sample)
-            with stage("loss: consistency"):
-                rows = torch.randint(
-                    max(count, 1), (min(spec.consistency_samples, count),), generator=self.generator
-                ).sort()[0]
-                distance = round_trip_distance(
-                    self.avatar.model,
-                    self.scene.parts,
-                    self.canonical,
-                    self.avatar.training_input(),
-                    out,
-                    sent(rows, self.avatar.device),
-                )
-                terms["consistency"] = spec.consistency * consistency_loss(
-                    distance, spec.consistency_threshold
-                )
-        return terms
+        avatar = self.avatar
+        return self.objective.deformation(
+            avatar.model, self.scene.parts, avatar.training_input(), out, self.generator
+        )
 
     def step(self, step: int, done: float) -> dict[str, float]:
         """One optimiser step.

@@ -57,7 +57,7 @@ def test_the_round_trip_looks_its_weights_up_again(trainer: Trainer, rendered: R
     count = len(rendered.shaded.pairs.sample)
     rows = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:150].sort()[0]
     inputs = trainer.avatar.training_input()
-    bodies = (trainer.scene.parts, trainer.canonical)
+    bodies = (trainer.scene.parts, trainer.objective.canonical)
     found = round_trip_distance(trainer.avatar.model, *bodies, inputs, rendered, rows).detach()
     expected, known = wanted_distance(trainer, rendered, rows)
     assert bool(known.all())

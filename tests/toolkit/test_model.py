@@ -198,7 +198,7 @@ def test_a_loss_that_is_not_finite_is_skipped_and_named(
     avatar = make(capture, small(deform={"residual": False}))
     trainer = Trainer(avatar)
     nan = torch.tensor(float("nan"), requires_grad=True)
-    monkeypatch.setattr("monopart.toolkit.train.color_loss", lambda *_: nan * 1.0)
+    monkeypatch.setattr("monopart.toolkit.objective.color_loss", lambda *_: nan * 1.0)
     before = {k: v.clone() for k, v in avatar.model.named_parameters()}
     trainer.step(0, 0.0)
     assert all(torch.equal(v, before[k]) for k, v in avatar.model.named_parameters())
