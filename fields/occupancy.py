@@ -88,12 +88,14 @@ class PartOccupancy(torch.nn.Module):
             sigma: their densities, 1/m.
         """
         sigma = sigma.detach()
+        unknown = ~sigma.isfinite()  # may be dense, may be empty: never skipped, never a wall
+        top, bottom = sigma.masked_fill(unknown, torch.inf), sigma.masked_fill(unknown, 0.0)
         old, low = self.peak[cell], self.floor[cell]
         first = old.isinf()
         self.peak[cell] = torch.where(first, 0.0, old * self.decay)
-        self.peak.scatter_reduce_(0, cell, sigma, "amax")
+        self.peak.scatter_reduce_(0, cell, top, "amax")
         self.floor[cell] = torch.where(first, torch.inf, low * _GROWTH)
-        self.floor.scatter_reduce_(0, cell, sigma, "amin")
+        self.floor.scatter_reduce_(0, cell, bottom, "amin")
 
 
 def visible_samples(

@@ -235,6 +235,20 @@ class Info:
 
 
 @dataclass(frozen=True)
+class Replay:
+    """Repeat a training step that was not finite, from the file that the training wrote."""
+
+    file: tyro.conf.Positional[Path]
+    """File in a run's folder culprits."""
+
+    def run(self) -> None:
+        """Print what was found then, and what is found now."""
+        from .replay import replay
+
+        replay(self.file)
+
+
+@dataclass(frozen=True)
 class Demo:
     """Train preset tiny on a small capture, evaluate, write turntable.mp4 and the report.
 
@@ -263,7 +277,7 @@ class Demo:
         commands.demo(self.capture, self.out, config, self.device)
 
 
-Command = Train | Eval | Render | Turntable | Info | Demo
+Command = Train | Eval | Render | Turntable | Info | Demo | Replay
 _Commands = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
@@ -271,6 +285,7 @@ _Commands = (
     | Annotated[Turntable, tyro.conf.subcommand("turntable")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Replay, tyro.conf.subcommand("replay")]
 )
 
 

@@ -128,6 +128,8 @@ class TrainConfig:
     deterministic: bool = False
     """On CUDA, sum gradients in one order, so that a seed repeats a run bit for bit; slower. The
     CPU always does."""
+    max_skipped: int = 50
+    """Steps that may be left out because a loss or a gradient was not finite; then a run ends."""
     checkpoint_seconds: float = 60.0
     """Wall-clock seconds between two saved checkpoints."""
     log_every: int = 20
@@ -170,7 +172,20 @@ def from_json(path: Path) -> Config:
         raise InputError(f"{path}: expected a run's config.json, found no file") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected JSON, found {error}; restore the file") from None
-    return _build(Config, data, str(path))
+    return config_of(data, str(path))
+
+
+def config_of(data: Any, where: str) -> Config:
+    """The configuration that :func:`to_json` wrote, from its parsed JSON.
+
+    Args:
+        data: parsed JSON.
+        where: what errors name.
+
+    Raises:
+        InputError: entries that are unknown, missing or mistyped.
+    """
+    return _build(Config, data, where)
 
 
 def _build(kind: Any, data: Any, where: str) -> Any:

@@ -1,13 +1,17 @@
 """Steps whose loss or gradient is not finite: named, counted, kept as a file, never applied."""
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+from monopart.fields.hash_grid import HashGrid
 
 from .captures.patches import PixelBatch
 from .model import Rendered
@@ -62,6 +66,23 @@ class BadStep:
         return dataclasses.asdict(self)
 
 
+def too_many(skipped: int, bad_steps: Sequence[dict], run: Path | None) -> str:
+    """What the error says that ends a run.
+
+    Args:
+        skipped: steps that were left out.
+        bad_steps: facts of the first of them.
+        run: the run folder, where there is one.
+    """
+    first = BadStep(**bad_steps[0])
+    look = "" if first.file is None else f"; repeat it by: monopart replay {run}/{first.file}"
+    kept = "" if run is None else "; the weights from before are saved"
+    return (
+        f"training: {skipped} steps were left out, as many as train.max_skipped allows{kept}. "
+        f"The first, {first.text()}. Lower train.lr_network and train.lr_table{look}"
+    )
+
+
 def gradients_are_finite(parameters: Iterable[Tensor]) -> bool:
     """Whether all gradients are finite and small enough to be squared; waits for the device once.
 
@@ -80,6 +101,29 @@ def gradients_are_finite(parameters: Iterable[Tensor]) -> bool:
     return bool(norms.max() <= HUGE)  # NaN compares false
 
 
+@contextlib.contextmanager
+def unchanged(trainer: "Trainer") -> Iterator[None]:
+    """Give the trainer its random state back, and the model what it remembers of a rendering.
+
+    Args:
+        trainer: used for a computation that must leave no trace.
+    """
+    model, state = trainer.avatar.model, trainer.generator.get_state()
+    memory = [(b, b.clone()) for b in (model.occupancy.peak, model.occupancy.floor)]
+    grids = [m for m in model.modules() if isinstance(m, HashGrid)]
+    adding = [grid.accumulate for grid in grids]
+    try:
+        for grid in grids:
+            grid.accumulate = False  # gradients go where they are asked for
+        yield
+    finally:
+        trainer.generator.set_state(state)
+        for buffer, old in memory:
+            buffer.copy_(old)
+        for grid, old in zip(grids, adding, strict=True):
+            grid.accumulate = old
+
+
 def diagnose(trainer: "Trainer", step: int, done: float, state: Tensor) -> BadStep:
     """Repeat a step on the same batch, term by term, and find what is not finite.
 
@@ -89,11 +133,10 @@ def diagnose(trainer: "Trainer", step: int, done: float, state: Tensor) -> BadSt
         done: finished part of the run, 0 to 1.
         state: random state from before the step.
     """
-    now = trainer.generator.get_state()
-    trainer.generator.set_state(state)
-    batch = trainer.draw(step, done)
-    terms, out = trainer.losses_of(batch, step)
-    trainer.generator.set_state(now)
+    with unchanged(trainer):
+        trainer.generator.set_state(state)
+        batch = trainer.draw(step, done)
+        terms, out = trainer.losses_of(batch, step)
     named = dict(trainer.avatar.model.named_parameters())
     bad = [n for n, t in terms.items() if not math.isfinite(float(t.detach()))]
     inner = dict(_inner(out))

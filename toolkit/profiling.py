@@ -127,7 +127,7 @@ def twin_of(trainer: Trainer) -> Trainer:
     twin.avatar = dataclasses.replace(trainer.avatar, model=model)
     twin.generator = torch.Generator()
     twin.generator.set_state(trainer.generator.get_state())
-    twin.run_folder, twin.result, twin.last, twin.bad_steps = None, TrainResult(), {}, 0
+    twin.run_folder, twin.result, twin.last = None, TrainResult(), {}
     return twin
 
 

@@ -11,20 +11,21 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
+from torch.func import functional_call
 
+from monopart.fields.hash_grid import HashGrid
 from monopart.geometry.body import BodyModel, BodyPose
 from monopart.geometry.cameras import Camera
 from monopart.geometry.errors import InputError
-from monopart.geometry.kinematics import KinematicTree
-from monopart.geometry.uv import UVMap
 
 from .atomic import write_bytes
 from .avatar import Avatar
+from .cache import content_key
 from .captures.cache import Pictures
 from .captures.patches import PixelBatch
 from .captures.records import CaptureRecord, Split
 from .config import config_of, to_json
-from .guard import BadStep, diagnose
+from .guard import BadStep, diagnose, unchanged
 
 if TYPE_CHECKING:
     from .train import Trainer
@@ -37,7 +38,9 @@ _BODY = ("v_template", "faces", "weights", "joint_regressor", "shapedirs", "pose
 def save_culprit(
     trainer: "Trainer", bad: BadStep, done: float, state: Tensor, folder: Path
 ) -> Path:
-    """Write a step with the learned tensors, its pixels and the bodies: no image is in it.
+    """Write a step: its pixels, poses and cameras, and what it touches of the learned tensors.
+
+    No image is in it, and no body, which licences may forbid to pass on.
 
     Args:
         trainer: in the state before the step.
@@ -47,21 +50,21 @@ def save_culprit(
         folder: where to; made if need be.
 
     Returns:
-        The file, some megabytes, of tensors and text alone.
+        The file, of tensors and text alone.
     """
     record, train = trainer.avatar.record, trainer.avatar.record.split("train")
-    now = trainer.generator.get_state()
-    trainer.generator.set_state(state)
-    batch = trainer.draw(bad.step, done)
-    after = trainer.generator.get_state()
-    trainer.generator.set_state(now)
-    tensors = {f"model.{k}": v for k, v in trainer.avatar.model.state_dict().items()}
-    tensors |= {f"batch.{f.name}": getattr(batch, f.name) for f in dataclasses.fields(batch)}
+    with unchanged(trainer):
+        trainer.generator.set_state(state)
+        batch = trainer.draw(bad.step, done)
+        after = trainer.generator.get_state()
+        rows_of = _touched(trainer, batch, bad.step)
+    tensors = {f"batch.{f.name}": getattr(batch, f.name) for f in dataclasses.fields(batch)}
     tensors["generator"] = after
-    tensors |= {f"body.{name}": getattr(record.body, name) for name in _BODY}
-    tensors["body.parents"] = torch.tensor(record.body.tree.parents)
-    if record.body.uv is not None:
-        tensors["body.corner_uv"] = record.body.uv.corner_uv
+    for name, value in trainer.avatar.model.state_dict().items():
+        rows = rows_of.get(name)
+        if rows is not None:
+            tensors[f"rows.{name}"] = rows
+        tensors[f"model.{name}"] = value if rows is None else value[rows]
     for field in dataclasses.fields(BodyPose):
         rows = [getattr(record.poses[f], field.name) for f in train.frames]
         tensors[f"poses.{field.name}"] = torch.stack(rows)
@@ -77,13 +80,54 @@ def save_culprit(
         "cameras": [record.camera_names[c] for c in train.cameras],
         "image_size": record.image_size,
         "frames": train.frames,
-        "joint_names": record.body.joint_names,
+        "body": _fingerprint(record.body),
     }
     path = folder / f"step_{bad.step:06d}.safetensors"
     contiguous = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
     folder.mkdir(parents=True, exist_ok=True)
     write_bytes(path, save(contiguous, metadata={"monopart": json.dumps(facts)}))
     return path
+
+
+def _fingerprint(body: BodyModel) -> str:
+    """What tells bodies apart."""
+    return content_key([getattr(body, name).cpu() for name in _BODY])
+
+
+def _touched(trainer: "Trainer", batch: PixelBatch, step: int) -> dict[str, Tensor]:
+    """Rows of large tensors that a step reads: of hash tables, and cells of the occupancy."""
+    model, seen, cells = trainer.avatar.model, {}, []
+    grids = {n: m for n, m in model.named_modules() if isinstance(m, HashGrid)}
+    keep = model.occupancy.cells_of
+
+    def remember(name: str) -> Any:
+        return lambda _, args: seen.setdefault(name, []).append([a.detach() for a in args])
+
+    def cells_of(*args: Tensor) -> Tensor:
+        cells.append(keep(*args))
+        return cells[-1]
+
+    hooks = [grid.register_forward_pre_hook(remember(name)) for name, grid in grids.items()]
+    try:
+        model.occupancy.cells_of = cells_of  # type: ignore[method-assign]
+        with torch.no_grad():
+            trainer.losses_of(batch, step)
+    finally:
+        del model.occupancy.cells_of
+        for hook in hooks:
+            hook.remove()
+    rows = {f"occupancy.{name}": torch.cat(cells).unique() for name in ("peak", "floor") if cells}
+    for name, calls in seen.items():
+        own = grids[name].table
+        used = ~own.detach().isfinite().all(-1)
+        for points, *rest in calls:
+            # a gradient is not 0 just where a row has a share in a feature
+            table = torch.ones_like(own, requires_grad=True)
+            features = functional_call(grids[name], {"table": table}, (points, *rest))
+            (grad,) = torch.autograd.grad(features.sum(), table)
+            used |= (grad != 0).any(-1)
+        rows[f"{name}.table"] = used.nonzero().squeeze(-1)
+    return rows
 
 
 @dataclass(frozen=True)
@@ -105,8 +149,8 @@ class Culprit:
     def repeat(self) -> tuple[dict[str, float], BadStep]:
         """Compute the step again: the terms, and what is not finite now."""
         state = self.trainer.generator.get_state()
-        terms, _ = self.trainer.losses(self.bad.step, self.done)
-        self.trainer.generator.set_state(state)
+        with unchanged(self.trainer):
+            terms, _ = self.trainer.losses(self.bad.step, self.done)
         return (
             {name: float(value.detach()) for name, value in terms.items()},
             diagnose(self.trainer, self.bad.step, self.done, state),
@@ -133,20 +177,22 @@ class _StoredPixels:
         return self._part(slice(self.rays, None))
 
 
-def load_culprit(path: Path) -> Culprit:
+def load_culprit(path: Path, body: BodyModel | None = None) -> Culprit:
     """Read what :func:`save_culprit` wrote.
 
     Args:
         path: the file.
+        body: the body of the capture; None is the default one.
 
     Returns:
         The step.
 
     Raises:
-        InputError: no such file, damaged, or of another version.
+        InputError: no such file, damaged, of another version or of another body.
     """
     from .train import Trainer
 
+    body = body or BodyModel.default()
     if not path.is_file():
         raise InputError(
             f"{path}: expected a file that training wrote into {FOLDER}/, found none; name one"
@@ -157,14 +203,13 @@ def load_culprit(path: Path) -> Culprit:
             facts = json.loads((file.metadata() or {})["monopart"])
         if facts["format"] != FORMAT:
             raise ValueError(f"format {facts['format']}")
-        record = _record(facts, tensors, path)
+        if facts["body"] != _fingerprint(body):
+            raise InputError(f"{path}: expected its body, found another; name it by --body")
+        record = _record(facts, tensors, path, body)
         config = config_of(facts["config"], str(path))
         avatar = Avatar.create(record, config)
-        model = {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
-        avatar.model.load_state_dict(model)
-        batch = PixelBatch(
-            *(tensors[f"batch.{f.name}"] for f in dataclasses.fields(PixelBatch))
-        )
+        avatar.model.load_state_dict(_whole(avatar.model.state_dict(), tensors))
+        batch = PixelBatch(*(tensors[f"batch.{f.name}"] for f in dataclasses.fields(PixelBatch)))
         bad = facts["bad"]
         bad |= {name: tuple(bad[name]) for name in ("terms", "tensors")}
         bad["pixel"] = None if bad["pixel"] is None else tuple(bad["pixel"])
@@ -185,15 +230,17 @@ def load_culprit(path: Path) -> Culprit:
     return Culprit(trainer, found, done, facts["capture"])
 
 
-def _record(facts: dict, tensors: dict[str, Tensor], path: Path) -> CaptureRecord:
-    """A capture of bodies and cameras, without pictures."""
-    uv = tensors.get("body.corner_uv")
-    body = BodyModel(
-        **{name: tensors[f"body.{name}"] for name in _BODY},
-        tree=KinematicTree.from_parents(tensors["body.parents"].tolist()),
-        uv=None if uv is None else UVMap(uv),
-        joint_names=tuple(facts["joint_names"]),
-    )
+def _whole(now: dict[str, Tensor], tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Learned tensors from the rows that were stored; rows that the step never reads stay."""
+    state = {}
+    for name, value in now.items():
+        stored, rows = tensors[f"model.{name}"], tensors.get(f"rows.{name}")
+        state[name] = stored if rows is None else value.index_copy(0, rows, stored)
+    return state
+
+
+def _record(facts: dict, tensors: dict[str, Tensor], path: Path, body: BodyModel) -> CaptureRecord:
+    """A capture of poses and cameras, without pictures."""
     size, frames = tuple(facts["image_size"]), tuple(facts["frames"])
     names = [f.name for f in dataclasses.fields(BodyPose)]
     poses = {
@@ -222,13 +269,14 @@ def _record(facts: dict, tensors: dict[str, Tensor], path: Path) -> CaptureRecor
     )
 
 
-def replay(path: Path) -> None:
+def replay(path: Path, body: Path | None = None) -> None:
     """Repeat a stored step and print what is not finite.
 
     Args:
         path: a file of a run's culprits folder.
+        body: file of the capture's body; None is the default body.
     """
-    culprit = load_culprit(path)
+    culprit = load_culprit(path, None if body is None else BodyModel.load(body))
     bad = culprit.bad
     print(f"{culprit.capture}, then: {bad.text()}")
     terms, now = culprit.repeat()

@@ -5,7 +5,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -22,14 +22,16 @@ from .captures.patches import PixelBatch, PixelSampler
 from .checkpoint import save_weights
 from .determinism import repeatable
 from .device import sent
+from .guard import diagnose, gradients_are_finite, too_many
 from .lpips import LPIPS, load_lpips
 from .model import Rendered
 from .objective import Objective, Seen
 from .optimizer import make_optimizer
+from .replay import FOLDER, save_culprit
 from .resume import forget_state, save_state
 from .skipping import EVERY
 
-MAX_BAD_STEPS = 20  # non-finite losses in a row after which a run ends
+KEPT_CULPRITS = 3  # skipped steps of a run that are diagnosed and written
 PRUNE = 2e-3  # absorption of a step below which a canonical cell counts as empty in training
 PROBE_EVERY = 16  # steps between two renderings without learned skipping, which refresh it
 
@@ -46,6 +48,8 @@ class TrainResult:
         cpu_seconds: processor seconds of the loop, all threads.
         stats: sums of the counts of rays, samples and pairs over all steps.
         warnings: what a reader of the report must know.
+        skipped: steps that were left out because a loss or a gradient was not finite.
+        bad_steps: facts of the first of them.
     """
 
     iterations: int = 0
@@ -53,6 +57,8 @@ class TrainResult:
     cpu_seconds: float = 0.0
     stats: Counter = field(default_factory=Counter)
     warnings: list[str] = field(default_factory=list)
+    skipped: int = 0
+    bad_steps: list[dict] = field(default_factory=list)
 
 
 class Trainer:
@@ -91,7 +97,6 @@ class Trainer:
         self.lpips = self._load_lpips()
         self.optimizer = make_optimizer(avatar.model, self.config)
         self.average = [p.detach().clone() for p in avatar.model.parameters()]
-        self.bad_steps = 0
         self.skip = EVERY  # what a step leaves out; a comparison switches kinds off
         self.last: dict[str, float] = {}
 
@@ -155,6 +160,20 @@ class Trainer:
         on = self.lpips is not None and done >= loop.lpips_start
         return on and step % loop.lpips_every == 0
 
+    def draw(self, step: int, done: float) -> PixelBatch:
+        """The pixels of a step: random ones, and behind them those of a patch where it has one.
+
+        Args:
+            step: number of the step, from 0.
+            done: finished part of the run, 0 to 1.
+        """
+        loop = self.config.train
+        with stage("batch"):
+            batch = self.sampler.random(loop.rays, self.generator)
+            if not self.has_patch(step, done):
+                return batch
+            return _joined(batch, self.sampler.patch(loop.patch, self.generator))
+
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Rendered]:
         """The weighted terms of one step.
 
@@ -165,13 +184,16 @@ class Trainer:
         Returns:
             Named terms whose sum is minimised, and the rendering.
         """
+        return self.losses_of(self.draw(step, done), step)
+
+    def losses_of(self, batch: PixelBatch, step: int) -> tuple[dict[str, Tensor], Rendered]:
+        """As :meth:`losses`, of given pixels.
+
+        Args:
+            batch: from :meth:`draw`.
+            step: number of the step, from 0.
+        """
         loop = self.config.train
-        with stage("batch"):
-            batch = self.sampler.random(loop.rays, self.generator)
-            with_patch = self.has_patch(step, done)
-            patch = self.sampler.patch(loop.patch, self.generator) if with_patch else None
-            if patch is not None:
-                batch = _joined(batch, patch)
         out = self._render(batch, step)
         ground = torch.zeros(3)
         if loop.random_background:
@@ -179,9 +201,10 @@ class Trainer:
         target = sent(batch.color + (~batch.mask)[:, None] * ground, self.avatar.device)
         color = out.color + (1.0 - out.opacity)[:, None] * sent(ground, self.avatar.device)
         shape = None
-        if patch is not None:
+        in_patch = len(batch.image) - loop.rays
+        if in_patch:
             height = min(loop.patch, self.sampler.height)
-            shape = (height, len(patch.image) // height)
+            shape = (height, in_patch // height)
         terms = self.objective.color(Seen(color, target, shape), self.lpips)
         terms.update(self._deformation_terms(out))
         return terms, out
@@ -199,6 +222,7 @@ class Trainer:
             The loss terms and the PSNR of the batch.
         """
         self.avatar.model.train()
+        before = self.generator.get_state()
         for group in self.optimizer.param_groups:
             group["lr"] = group["base_lr"] * self.config.train.lr_final**done
         terms, out = self.losses(step, done)
@@ -207,11 +231,11 @@ class Trainer:
         numbers = dict(zip(terms, values.tolist(), strict=True))  # one wait for the device
         self.optimizer.zero_grad(set_to_none=True)
         if not all(map(math.isfinite, numbers.values())):
-            self._bad_step(numbers)
-            return self.last
-        self.bad_steps = 0
+            return self._skip(step, done, before)
         with stage("backward"):
             values.sum().backward()
+        if not gradients_are_finite(self.avatar.model.parameters()):
+            return self._skip(step, done, before)
         with stage("optimiser"):
             self.optimizer.step()
         with stage("average of the weights"):
@@ -221,18 +245,23 @@ class Trainer:
         self.last["psnr"] = -10.0 * math.log10(max(mse, 1e-12))
         return self.last
 
-    def _bad_step(self, numbers: dict[str, float]) -> None:
-        """Skip a step whose loss is not finite; end the run when that keeps happening."""
-        self.bad_steps += 1
-        named = ", ".join(n for n, value in numbers.items() if not math.isfinite(value))
-        if self.bad_steps >= MAX_BAD_STEPS:
+    def _skip(self, step: int, done: float, before: Tensor) -> dict[str, float]:
+        """Leave a step out whose loss or gradient is not finite; end the run after too many."""
+        self.optimizer.zero_grad(set_to_none=True)
+        self.result.skipped += 1
+        if self.result.skipped <= KEPT_CULPRITS:
+            bad = diagnose(self, step, done, before)
+            if self.run_folder is not None:
+                file = save_culprit(self, bad, done, before, self.run_folder / FOLDER)
+                bad = replace(bad, file=f"{FOLDER}/{file.name}")
+            self.result.bad_steps.append(bad.facts())
+            self.result.warnings.append(f"A step was skipped. {bad.text()}.")
+        if self.result.skipped >= self.config.train.max_skipped:
+            self.checkpoint()
             raise MonopartError(
-                f"training: the terms {named} were not finite in {MAX_BAD_STEPS} steps in a row; "
-                "lower train.lr_network and train.lr_table"
+                too_many(self.result.skipped, self.result.bad_steps, self.run_folder)
             )
-        message = f"A step was skipped because {named} was not finite."
-        if message not in self.result.warnings:
-            self.result.warnings.append(message)
+        return self.last
 
     @torch.no_grad()
     def _average(self, step: int) -> None:
