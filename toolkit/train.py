@@ -18,6 +18,7 @@ from monopart.geometry.stages import stage
 
 from .avatar import Avatar
 from .captures.cache import Pictures, read_pictures
+from .captures.doubts import picture_doubts
 from .captures.patches import PixelBatch, PixelSampler
 from .checkpoint import save_weights
 from .determinism import repeatable
@@ -93,7 +94,8 @@ class Trainer:
         canonical = avatar.canonical_parts() if self.config.loss.consistency else None
         self.objective = Objective(self.config, canonical)
         self.generator = torch.Generator().manual_seed(self.config.seed)
-        self.result = TrainResult()
+        doubts = picture_doubts(avatar.record, seen, self.config.train.patch)
+        self.result = TrainResult(warnings=doubts)
         self.lpips = self._load_lpips()
         self.optimizer = make_optimizer(avatar.model, self.config)
         self.average = [p.detach().clone() for p in avatar.model.parameters()]

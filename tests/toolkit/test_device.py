@@ -36,7 +36,7 @@ WAITS_OF_A_STEP = {
     "toolkit.train.step tolist": 1,  # the losses
     "toolkit.guard.gradients_are_finite __bool__": 1,  # a step that is not finite is left out
 }
-"""Sizes that the next kernels need, the losses and the gradients: the only waits of a training step."""
+"""Sizes that the next kernels need, losses and gradients: all the waits of a training step."""
 
 
 @pytest.fixture(scope="module")

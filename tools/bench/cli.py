@@ -86,6 +86,12 @@ def _stability_arguments(commands: "argparse._SubParsersAction[argparse.Argument
     command.add_argument("--only", action="append", default=[], metavar="OPERATION")
     command.add_argument("--out", type=Path, default=Path("runs/bench"), metavar="DIR")
     command.add_argument("--into", type=Path, metavar="PAGE", help="write tables and maps into it")
+    text = "trainings with spoilt input: no NaN, an end, and a word on what is wrong"
+    command = commands.add_parser("stability-training", help=text, description=text)
+    command.add_argument("capture", type=Path, metavar="CAPTURE")
+    command.add_argument("--seeds", type=int, default=20, metavar="N")
+    command.add_argument("--steps", type=int, default=60, metavar="N")
+    command.add_argument("--into", type=Path, metavar="PAGE", help="write the table into it")
 
 
 def main(argv: Sequence[str] | None = None) -> int | None:
@@ -120,6 +126,10 @@ def _run(arguments: argparse.Namespace) -> None:
 
         size = "exhaustive" if arguments.exhaustive else "quick" if arguments.quick else "usual"
         command(size, arguments.only, arguments.out, arguments.into)
+    elif arguments.command == "stability-training":
+        from .stability_training import command
+
+        command(arguments.capture, arguments.seeds, arguments.steps, arguments.into)
     elif arguments.command == "show":
         from .results import read_report
         from .show import markdown, print_report
