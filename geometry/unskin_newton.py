@@ -185,7 +185,15 @@ class SolverOutput:
 
     @classmethod
     def of(cls, points: Float[Tensor, "n 3"], joints: int) -> "SolverOutput":
-        """Room for the results of some targets."""
+        """Room for the results of some targets.
+
+        Args:
+            points: the targets.
+            joints: number of joints.
+
+        Returns:
+            Tensors that are not initialised.
+        """
         count, device = len(points), points.device
         return cls(
             torch.empty_like(points),
@@ -196,20 +204,36 @@ class SolverOutput:
         )
 
     def views(self) -> list[Any]:
-        """Launch arguments, in the order of the attributes."""
+        """Launch arguments, in the order of the attributes.
+
+        Returns:
+            Views.
+        """
         from .kernels.launch import view
 
         mask = [view(self.place), view(self.residual), view(self.invertible)]
         return [view(self.rest, 3), view(self.weights), *mask]
 
     def roots(self) -> Roots:
-        """The roots, after the launches."""
+        """The roots, after the launches.
+
+        Returns:
+            Roots that share these tensors.
+        """
         residual = torch.where(self.place >= 0, self.residual, math.inf)
         return Roots(self.rest, self.place.clamp(min=0).long(), residual, self.invertible)
 
 
 def limits_of(plan: Plan) -> tuple[float, float, float, float]:
-    """Limits of a kernel that solves: see `kernels.newton.solve`."""
+    """Limits of a kernel that solves.
+
+    Args:
+        plan: how to search.
+
+    Returns:
+        Residual that ends the iterations, residual that ends the starts, smallest determinant and
+        reach: see `kernels.newton.solve`.
+    """
     return plan.stop, ARRIVED, MIN_DET, min(plan.max_distance, LIMIT)
 
 
