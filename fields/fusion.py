@@ -1,14 +1,18 @@
 """Pose features ask a table of appearance codes: cross-attention per part (MonoPartNeRF, eq. 6)."""
 
+import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
-from monopart.geometry.errors import InputError
+from monopart.geometry.errors import BackendError, InputError
 
+from .backend import Backend, choose_backend
 from .mlp import PartMLP
 
 
@@ -102,6 +106,7 @@ def attend(
     keys: Float[Tensor, "k c h d"],
     values: Float[Tensor, "k c h d"],
     counts: Sequence[int],
+    backend: Backend = "auto",
 ) -> Float[Tensor, "n h d"]:
     """Scaled dot-product attention of rows sorted by part over the set of their part.
 
@@ -110,6 +115,8 @@ def attend(
         keys: keys of each part.
         values: values of each part.
         counts: rows of each part.
+        backend: ``warp`` (float32, one derivative), ``torch`` (any dtype, any order), ``auto``:
+            on the CPU as elsewhere, on CUDA torch, whose matrix products win there.
 
     Returns:
         Per head the mean of the values, weighted by the softmax of query · key / √d.
@@ -118,9 +125,75 @@ def attend(
     >>> attend(torch.rand(4, 2, 3), one, 5 * one, (4,)).unique().tolist()
     [5.0]
     """
+    if backend == "auto" and query.device.type == "cuda":
+        backend = "torch"
+    if choose_backend(backend, query) == "warp":
+        return _WarpAttention.apply(query, keys, values, tuple(counts))
     scale = 1 / math.sqrt(query.shape[-1])
     found = []
     for q, k, v in zip(query.split(list(counts)), keys, values, strict=True):
         score = torch.einsum("nhd,chd->hnc", q, k) * scale
         found.append(torch.einsum("hnc,chd->nhd", score.softmax(-1), v))
     return torch.cat(found)
+
+
+_LANES = 16  # codes that the kernels take at once
+_NEVER = -1e30  # score of a padded code
+
+
+class _WarpAttention(torch.autograd.Function):
+    """Attention and its first derivative on the Warp kernels."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, query: Tensor, keys: Tensor, values: Tensor, counts: tuple[int, ...]
+    ) -> Tensor:
+        from monopart.geometry.kernels.launch import launch, view
+
+        from .kernels.fusion import attention_kernel
+
+        query = query.contiguous()
+        rows, heads, dim = query.shape
+        codes = keys.shape[1]
+        missing = -codes % _LANES
+        # [part, head, d, code]
+        keys, values = (
+            functional.pad(x.permute(0, 2, 3, 1), (0, missing)).contiguous() for x in (keys, values)
+        )
+        bias = functional.pad(query.new_zeros(codes), (0, missing), value=_NEVER)
+        ends = torch.tensor(list(itertools.accumulate(counts)), dtype=torch.int32)
+        sets = (ends.to(query.device), query, keys, values, bias)
+        out, total = torch.empty_like(query), query.new_empty(rows, heads)
+        args = [1 / math.sqrt(dim), *(view(x.view(-1)) for x in (*sets, out, total))]
+        launch(attention_kernel(heads, dim, codes + missing), rows, args, query)
+        ctx.save_for_backward(*sets, out, total)
+        ctx.codes = codes
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            raise BackendError(
+                "attend: the warp back end has no second derivative (create_graph=True); "
+                "pass backend='torch'"
+            )
+        from monopart.geometry.kernels.launch import launch_jobs, view
+
+        from .kernels.fusion import attention_gradient_kernel
+
+        _, query, keys, values, *_ = saved = ctx.saved_tensors
+        rows, heads, dim = query.shape
+        cotangent = cotangents[0].contiguous()
+        grads = [torch.zeros_like(x) for x in (query, keys, values)]
+        args = [1 / math.sqrt(dim), *(view(x.view(-1)) for x in (*saved, cotangent))]
+        places = [view(x.view(-1)) for x in grads]
+        # disjoint heads per job: no atomics, and the same sums for any number of threads
+        jobs = 1 if query.device.type == "cuda" else min(heads, torch.get_num_threads())
+        launch_jobs(
+            attention_gradient_kernel(heads, dim, keys.shape[-1]),
+            [[*args, job, jobs, *places] for job in range(jobs)],
+            rows,
+            query,
+        )
+        by_code = (g[..., : ctx.codes].permute(0, 3, 1, 2) for g in grads[1:])
+        return grads[0], *by_code, None

@@ -1,10 +1,15 @@
 """Pose features of canonical points: blended line banks of key poses (MonoPartNeRF, eq. 5)."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from monopart.geometry.errors import InputError
+from monopart.geometry.errors import BackendError, InputError
+
+from .backend import Backend, choose_backend
+from .hash_grid import zeros_of
 
 _INIT = 0.1
 
@@ -99,6 +104,7 @@ class PoseBank(torch.nn.Module):
         body: Int[Tensor, "n"] | None,
         rows: Int[Tensor, "b k m"],
         weights: Float[Tensor, "b k m"],
+        backend: Backend = "auto",
     ) -> Float[Tensor, "n f"]:
         """Pose features of canonical points.
 
@@ -109,33 +115,104 @@ class PoseBank(torch.nn.Module):
             body: body of each point; None is body 0.
             rows: key poses of each body and part.
             weights: their weights.
+            backend: ``warp`` (float32, one derivative, in the lines alone), ``torch`` (any dtype,
+                any order, also in the weights), ``auto``: warp where it serves.
 
         Returns:
             [N, 3·C] features, x before y before z; differentiable in the lines and the weights.
 
         Raises:
             InputError: rows and weights that do not fit the parts or each other.
+            BackendError: ``warp`` asked for and not able to run.
         """
         if rows.shape != weights.shape or rows.shape[1] != len(self.lo):
             raise InputError(
                 f"PoseBank rows, weights: expected equal shapes [bodies, {len(self.lo)}, count], "
                 f"found {tuple(rows.shape)} and {tuple(weights.shape)}"
             )
-        cell, inside = self._cells(points, part)
+        last = self.lines.shape[3] - 1
+        place = ((points.detach() - self.lo[part]) / self.extent[part]).clamp(0, 1) * last
+        owner = torch.zeros_like(part) if body is None else body
+        if backend == "auto" and weights.requires_grad:
+            backend = "torch"
+        if choose_backend(backend, self.lines) == "torch":
+            return self._forward_torch(place, part, owner, rows, weights)
+        if weights.requires_grad:
+            raise BackendError(
+                "backend 'warp': expected weights that need no gradient; pass backend='torch'"
+            )
+        if len(rows) == 1 and rows.shape[2] > 1:  # one body: its lines once, not for each point
+            lines, first = self.blend(rows, weights), slice(0, 1)
+            rows, weights = torch.zeros_like(rows[..., first]), torch.ones_like(weights[..., first])
+            return _WarpBank.apply(lines, place, part, owner, rows, weights)
+        return _WarpBank.apply(self.lines, place, part, owner, rows, weights)
+
+    def _forward_torch(
+        self, place: Tensor, part: Tensor, owner: Tensor, rows: Tensor, weights: Tensor
+    ) -> Tensor:
+        """Blend the lines of all bodies, then look up: the readable twin of the kernels."""
+        cell = place.long().clamp(0, self.lines.shape[3] - 2)
         lines = self.blend(rows, weights)
         knots, channels = lines.shape[-2:]
-        owner = torch.zeros_like(part) if body is None else body
         line = (part.long() * lines.shape[1] + owner.long())[:, None] * 3
         at = (line + torch.arange(3, device=line.device)) * knots + cell
         table = lines.reshape(-1, channels)
         # index_select: the gradient of [] adds up in an order that changes with two threads
         near = table.index_select(0, at.flatten()).view(-1, 3, channels)
         far = table.index_select(0, at.flatten() + 1).view(-1, 3, channels)
-        return torch.lerp(near, far, inside[..., None]).flatten(1)
+        return torch.lerp(near, far, (place - cell)[..., None]).flatten(1)
 
-    def _cells(self, points: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
-        """Knot below the coordinate of each axis, [N, 3], and the way to the next in [0, 1]."""
-        last = self.lines.shape[3] - 1
-        place = ((points.detach() - self.lo[part]) / self.extent[part]).clamp(0, 1) * last
-        cell = place.long().clamp(0, last - 1)
-        return cell, place - cell
+
+class _WarpBank(torch.autograd.Function):
+    """Look-up on blended lines and its derivative in the lines on the Warp kernels."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        lines: Tensor,
+        place: Tensor,
+        part: Tensor,
+        owner: Tensor,
+        rows: Tensor,
+        weights: Tensor,
+    ) -> Tensor:
+        from monopart.geometry.kernels.launch import launch, view
+
+        from .kernels.pose_bank import bank_kernel
+
+        parts, poses, _, knots, channels = lines.shape
+        lines, count = lines.contiguous(), rows.shape[2]
+        shape = torch.tensor([poses, knots, parts], dtype=torch.int32).to(lines.device)
+        part, owner, rows = (x.to(torch.int32).contiguous() for x in (part, owner, rows))
+        saved = (place.contiguous().view(-1), part, owner, rows.view(-1, count))
+        saved = (*saved, weights.contiguous().view(-1), shape)
+        out = lines.new_empty(len(part), 3 * channels)
+        args = [view(x) for x in (*saved, lines.view(-1), out.view(-1))]
+        launch(bank_kernel(channels), len(part), args, lines)
+        ctx.save_for_backward(*saved)
+        ctx.size = lines.shape
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            raise BackendError(
+                "pose bank: the warp back end has no second derivative (create_graph=True); "
+                "pass backend='torch'"
+            )
+        from monopart.geometry.kernels.launch import launch_jobs, view
+
+        from .kernels.pose_bank import bank_gradient_kernel
+
+        cotangent = cotangents[0].contiguous()
+        grad = zeros_of(ctx.size, cotangent)
+        args = [view(x) for x in (*ctx.saved_tensors, cotangent.view(-1))]
+        # disjoint key poses per job: no atomics, and the same sums for any number of threads
+        jobs = 1 if grad.device.type == "cuda" else torch.get_num_threads()
+        launch_jobs(
+            bank_gradient_kernel(ctx.size[-1]),
+            [[*args, job, jobs, view(grad.view(-1))] for job in range(jobs)],
+            len(cotangent),
+            grad,
+        )
+        return grad, *(None,) * 5
