@@ -28,6 +28,7 @@ class PartFieldSpec:
         geometry: features handed from the density to the colour network.
         code: length of the appearance feature of a sample.
         sharpness: density in 1/m per unit of softplus.
+        density_code: whether the density sees the appearance feature too.
     """
 
     levels: int = 8
@@ -39,6 +40,7 @@ class PartFieldSpec:
     geometry: int = 16
     code: int = 0
     sharpness: float = 100.0
+    density_code: bool = False
 
     def grid_specs(self, extent: Sequence[float]) -> list[GridSpec]:
         """Grid of each part from the longest edge of its box, metres."""
@@ -80,7 +82,8 @@ class PartField(torch.nn.Module):
         self.register_buffer("edge", edge.clone(), persistent=False)
         self.grid = HashGrid(spec.grid_specs(edge.tolist()))
         width = self.grid.out_features
-        self.density_mlp = PartMLP(parts, (width, spec.hidden, 1 + spec.geometry))
+        seen = width + (spec.code if spec.density_code else 0)
+        self.density_mlp = PartMLP(parts, (seen, spec.hidden, 1 + spec.geometry))
         inputs = width + spec.geometry + spec.code
         self.color_mlp = PartMLP(parts, (inputs, spec.hidden, spec.hidden, 3))
 
@@ -93,6 +96,7 @@ class PartField(torch.nn.Module):
         encoded: Float[Tensor, "n w"],
         counts: Sequence[int],
         prior: Float[Tensor, "n"] | float = 0.0,
+        code: Float[Tensor, "n c"] | None = None,
     ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n g"]]:
         """Density and geometry features of pairs sorted by part.
 
@@ -100,11 +104,13 @@ class PartField(torch.nn.Module):
             encoded: from :meth:`encode`.
             counts: rows of each part.
             prior: added to the network's output before the softplus.
+            code: appearance features, where the spec lets the density see them.
 
         Returns:
             Density in 1/m and the features for :meth:`color`.
         """
-        out = self.density_mlp(encoded, counts)
+        inputs = encoded if code is None else torch.cat([encoded, code], -1)
+        out = self.density_mlp(inputs, counts)
         return self.spec.sharpness * functional.softplus(out[:, 0] + prior), out[:, 1:]
 
     def color(

@@ -3,16 +3,18 @@
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from monopart.geometry.body import BodyPose, PosedBody
 from monopart.geometry.cameras import Camera
 from monopart.geometry.posed_parts import PosedParts
 
+from .appearance import FrameInput
 from .cache import NO_CACHE, Cache
 from .captures.records import CaptureRecord
 from .config import Config
 from .memory import PoseMemory
-from .model import AvatarModel, FrameInput
+from .model import AvatarModel
 from .prepared import distance_prior
 from .scene import SceneBodies, canonical_body, stack_poses
 
@@ -48,7 +50,9 @@ class Avatar:
             prior = distance_prior(canonical.verts, record.body.faces, cache)
         model = AvatarModel(config, record.body, canonical, len(frames), prior)
         model.to(canonical.verts.device)  # initial values are drawn on the CPU: the same anywhere
-        return cls(record, config, canonical, PoseMemory.build(frames, poses), model, cache)
+        table = model.parts if config.appearance.pose_feature else None
+        memory = PoseMemory.build(frames, poses, table)
+        return cls(record, config, canonical, memory, model, cache)
 
     @property
     def device(self) -> torch.device:
@@ -64,13 +68,21 @@ class Avatar:
         body = self.record.body
         return PosedParts(body, self.canonical, self.canonical, self.model.parts)
 
-    def training_input(self) -> FrameInput:
-        """Times and codes of the training frames, in order; codes carry gradients."""
-        rows = torch.arange(len(self.memory.frames), device=self.device)
-        return FrameInput(self.memory.time(rows), self.model.codes)
+    def training_input(self, left_out: Tensor | None = None) -> FrameInput:
+        """Times, codes and key poses of the training frames, in order; codes carry gradients.
+
+        Args:
+            left_out: [F] frames whose key poses are those of an unseen pose: the nearest others.
+        """
+        time = self.memory.time(torch.arange(len(self.memory.frames), device=self.device))
+        if self.memory.parts is None:
+            return FrameInput(time, self.model.codes)
+        return FrameInput(time, self.model.codes, *self.memory.parts.training(left_out))
 
     def frame_input(self, frame: int | None, pose: BodyPose) -> FrameInput:
-        """Time and code of one pose: its own for a training frame, else blended from the nearest.
+        """What is known of one pose: its own for a training frame, else blended from the nearest.
+
+        Times and codes of frames are weighted by the whole pose, key poses by that of each part.
 
         Args:
             frame: frame number, or None for a pose that no frame has.
@@ -80,7 +92,12 @@ class Avatar:
         code = None
         if self.model.codes is not None:
             code = (weights[:, None] * self.model.codes[rows]).sum(0, keepdim=True)
-        return FrameInput(self.memory.time(rows[:1]), code)
+        time = self.memory.time(rows[:1])
+        if self.config.appearance.blend_time:
+            time = (weights * self.memory.time(rows)).sum(0, keepdim=True)
+        if self.memory.parts is None:
+            return FrameInput(time, code)
+        return FrameInput(time, code, *self.memory.parts.of_pose(frame, pose.pose))
 
     def pose_scene(self, pose: BodyPose) -> SceneBodies:
         """One freely posed body."""

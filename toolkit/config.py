@@ -71,7 +71,26 @@ class AppearanceConfig:
     """Appearance of a frame (METHOD section 5)."""
 
     code: int = 8
-    """Length of the code of a training frame; 0 is one appearance for all frames."""
+    """Length of an appearance code (rgb_latent); 0 has none: one appearance for all frames."""
+    pose_feature: bool = False
+    """Part pose embedding: lines of the key poses, which are the training frames (eq. 5)."""
+    knots: int = 128
+    """Values along a line of the pose embedding."""
+    channels: int = 20
+    """Features of a line."""
+    fusion: bool = True
+    """Where there are pose features and codes: cross-attention over the codes of a part (eq. 6).
+    Off, or where one is missing, what there is is fed directly, with one code per frame."""
+    codes: int = 100
+    """Codes of a part that the attention chooses from."""
+    fused: int = 16
+    """Length of the fused feature."""
+    density_sees_fusion: bool = False
+    """The density sees the same feature as the colour (eq. 7)."""
+    leave_out: float = 0.5
+    """Share of training poses that are blended from their neighbours, like an unseen pose."""
+    blend_time: bool = False
+    """An unseen pose has the mean time of the nearest training poses; off, that of the nearest."""
 
 
 @dataclass(frozen=True)

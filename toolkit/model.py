@@ -19,23 +19,11 @@ from monopart.geometry.parts import PartMap, rows_of_parts
 from monopart.geometry.posed_parts import PartPairs, PosedParts, RestPoints
 from monopart.geometry.stages import stage
 
+from .appearance import Appearance, FrameInput, feature_width, fuses
 from .config import Config
 from .skipping import EVERY, Skipping
 
 HIDDEN = 10.0  # optical depth in front of a sample that hides it: 5e-5 of the light is left
-
-
-@dataclass(frozen=True)
-class FrameInput:
-    """What the networks know about each body of a batch.
-
-    Attributes:
-        time: [B] normalised time in [0, 1].
-        code: [B, C] appearance codes, or None.
-    """
-
-    time: Tensor
-    code: Tensor | None
 
 
 @dataclass(frozen=True)
@@ -124,7 +112,8 @@ class AvatarModel(torch.nn.Module):
                 finest=spec.finest,
                 hidden=spec.hidden,
                 geometry=spec.geometry_features,
-                code=config.appearance.code,
+                code=feature_width(config.appearance),
+                density_code=config.appearance.density_sees_fusion,
                 sharpness=spec.sharpness,
             ),
         )
@@ -142,12 +131,15 @@ class AvatarModel(torch.nn.Module):
                     self.num_parts, deform.scale, grid, deform.hidden
                 )
         self.codes = None
-        if config.appearance.code:
+        if config.appearance.code and not fuses(config.appearance):
             codes = 0.01 * torch.randn(frames, config.appearance.code)
             self.codes = torch.nn.Parameter(codes)
+        self.appearance = Appearance(config.appearance, lo, hi, frames)
         self.occupancy = PartOccupancy(self.field.lo, self.field.edge)
 
-    def density_of(self, points: Tensor, part: Tensor, counts: tuple[int, ...]) -> tuple:
+    def density_of(
+        self, points: Tensor, part: Tensor, counts: tuple[int, ...], code: Tensor | None = None
+    ) -> tuple:
         """Density, geometry features and hash features of canonical points sorted by part."""
         with stage("hash encode"):
             encoded = self.field.encode(points, part)
@@ -157,7 +149,7 @@ class AvatarModel(torch.nn.Module):
                 spec = self.config.field
                 distance = self.prior(points.detach())
                 prior = (spec.prior_slope * (spec.prior_margin - distance)).clamp(-8.0, 8.0)
-            sigma, geometry = self.field.density(encoded, counts, prior)
+            sigma, geometry = self.field.density(encoded, counts, prior, code)
         return sigma, geometry, encoded
 
     def _kept(
@@ -212,7 +204,10 @@ class AvatarModel(torch.nn.Module):
                 uvt = torch.cat([uv, frames.time[owner, None]], -1)
                 residual = self.backward_residual(uvt, pairs.part, pairs.counts)
                 canonical = points + residual
-        sigma, geometry, encoded = self.density_of(canonical, pairs.part, pairs.counts)
+        code = None
+        if self.config.appearance.density_sees_fusion:
+            code = self.appearance(frames, canonical, pairs.part, owner, pairs.counts)
+        sigma, geometry, encoded = self.density_of(canonical, pairs.part, pairs.counts, code)
         if self.training:
             with stage("occupancy"):
                 self.occupancy.see(cell, sigma)
@@ -222,8 +217,11 @@ class AvatarModel(torch.nn.Module):
         with stage("colour"):
             rows = union.winner if skip.colors else torch.arange(len(sigma), device=sigma.device)
             counted = union.counts if skip.colors else pairs.counts
-            # index_select: the gradient of [] adds up in an order that changes with two threads
-            code = None if frames.code is None else frames.code.index_select(0, owner[rows])
+            if code is None:
+                part, of = pairs.part[rows], owner[rows]
+                code = self.appearance(frames, canonical[rows], part, of, counted)
+            else:
+                code = code.index_select(0, rows)
             rgb = self.field.color(encoded[rows], geometry[rows], code, counted)
             shown = rgb if skip.colors else rgb[union.winner]
             color = rgb.new_zeros(total, 3).index_copy(0, pairs.sample[union.winner], shown)

@@ -144,13 +144,21 @@ class Trainer:
             jitter = sent(torch.rand(len(body), generator=self.generator), self.avatar.device)
         return self.avatar.model.render_rays(
             self.scene.parts,
-            self.avatar.training_input(),
+            self.avatar.training_input(self._left_out()),
             rays,
             body,
             jitter,
             prune=0.0 if self.is_probe(step) or not self.skip.cells else PRUNE,
             skip=self.skip,
         )
+
+    def _left_out(self) -> Tensor | None:
+        """Training poses of a step that are treated as unseen; None where nothing asks."""
+        share = self.config.appearance.leave_out
+        if self.avatar.memory.parts is None or not share:
+            return None
+        drawn = torch.rand(len(self.scene.frames), generator=self.generator)
+        return sent(drawn < share, self.avatar.device)
 
     def is_probe(self, step: int) -> bool:
         """Whether a step evaluates learned empty cells too, which refreshes them."""

@@ -21,12 +21,16 @@ from .cubin import KernelFacts, kernel_facts
 
 PACKAGES = ("monopart.geometry.kernels", "monopart.fields.kernels")
 FACTORIES: dict[str, tuple[tuple[Any, ...], ...]] = {
+    "attention_gradient_kernel": ((4, 8, 112),),
+    "attention_kernel": ((4, 8, 112),),
+    "bank_gradient_kernel": ((20,),),
+    "bank_kernel": ((20,),),
     "forward_kernel": ((1,), (2,), (4,)),
     "points_kernel": ((1,), (2,), (4,)),
     "table_kernel": ((1,), (2,), (4,)),
     "row_adam_kernel": ((1,), (2,), (3,), (4,)),
 }
-"""Functions that make kernels, with all arguments that they serve."""
+"""Functions that make kernels, with all arguments that they serve, or those of the presets."""
 LEAST_ARCH = 75  # Turing: PTX for it runs on every later GPU
 
 
