@@ -9,6 +9,7 @@ from monopart.geometry.cameras import Camera
 from monopart.geometry.posed_parts import PosedParts
 
 from .cache import NO_CACHE, Cache
+from .capacity import allocated
 from .captures.records import CaptureRecord
 from .config import Config
 from .memory import PoseMemory
@@ -40,6 +41,7 @@ class Avatar:
     @classmethod
     def create(cls, record: CaptureRecord, config: Config, cache: Cache = NO_CACHE) -> "Avatar":
         """An untrained avatar on the device of a capture, from the global random state."""
+        config, _ = allocated(config, record, cache=cache)
         frames = record.split("train").frames
         canonical = canonical_body(record)
         poses = torch.stack([record.poses[f].pose for f in frames])

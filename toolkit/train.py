@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,15 +19,17 @@ from monopart.geometry.stages import stage
 
 from .avatar import Avatar
 from .captures.cache import Pictures, read_pictures
-from .captures.patches import PixelBatch, PixelSampler
+from .captures.patches import Box, PixelBatch, PixelSampler, joined
 from .checkpoint import save_weights
 from .determinism import repeatable
 from .device import sent
 from .lpips import LPIPS, load_lpips
 from .model import Rendered
-from .objective import Objective, Seen
+from .objective import Objective, seen_batch
 from .optimizer import make_optimizer
 from .resume import forget_state, save_state
+from .round_trips import MOMENTS, figures, moment
+from .schedule import Looks, head_box
 from .skipping import EVERY
 
 MAX_BAD_STEPS = 20  # non-finite losses in a row after which a run ends
@@ -46,6 +49,8 @@ class TrainResult:
         cpu_seconds: processor seconds of the loop, all threads.
         stats: sums of the counts of rays, samples and pairs over all steps.
         warnings: what a reader of the report must know.
+        round_trips: histograms of the round-trip distances at some moments.
+        capacity: size of each part's field.
     """
 
     iterations: int = 0
@@ -53,6 +58,8 @@ class TrainResult:
     cpu_seconds: float = 0.0
     stats: Counter = field(default_factory=Counter)
     warnings: list[str] = field(default_factory=list)
+    round_trips: list[dict[str, Any]] = field(default_factory=list)
+    capacity: list[dict[str, Any]] = field(default_factory=list)
 
 
 class Trainer:
@@ -77,13 +84,15 @@ class Trainer:
         self.config = avatar.config
         train = avatar.record.split("train")
         seen = pictures or read_pictures(avatar.record, "train", avatar.cache, progress)
-        self.sampler = PixelSampler(seen.images, seen.masks, self.config.train.band)
         self.scene = avatar.scene(train.frames)
         self.body_of_image = torch.tensor([train.frames.index(f) for _, f in train.pairs()])
         self.camera_of_image = torch.tensor([train.cameras.index(c) for c, _ in train.pairs()])
         host = torch.zeros(())
         # The host draws batches, and so the same ones for every device; see `sent`.
-        self.train_cameras = [avatar.record.cameras[c].to(host) for c in train.cameras]
+        cameras = [avatar.record.cameras[c].to(host) for c in train.cameras]
+        heads = self._heads() if self.config.train.head_focus else None
+        self.looks = Looks(seen, cameras, heads, self.config.train)
+        self.look = self.looks.at(0.0)
         canonical = avatar.canonical_parts() if self.config.loss.consistency else None
         self.objective = Objective(self.config, canonical)
         self.generator = torch.Generator().manual_seed(self.config.seed)
@@ -94,6 +103,16 @@ class Trainer:
         self.bad_steps = 0
         self.skip = EVERY  # what a step leaves out; a comparison switches kinds off
         self.last: dict[str, float] = {}
+
+    @property
+    def sampler(self) -> PixelSampler:
+        """What draws the pixels of a step from now on; see `_look_at`."""
+        return self.look.sampler
+
+    def _heads(self) -> list[Box]:
+        record, verts = self.avatar.record, self.scene.posed.verts_world
+        pairs = zip(self.body_of_image.tolist(), record.split("train").pairs(), strict=True)
+        return [head_box(verts[b], record.body, record.cameras[c]) for b, (c, _) in pairs]
 
     def _load_lpips(self) -> LPIPS | None:
         if not self.config.loss.lpips:
@@ -111,7 +130,7 @@ class Trainer:
         body = self.body_of_image[batch.image]
         camera = self.camera_of_image[batch.image]
         origins, directions = torch.zeros(2, len(body), 3).unbind(0)
-        for index, cam in enumerate(self.train_cameras):
+        for index, cam in enumerate(self.look.cameras):
             rows = camera == index
             world = cam.rays(batch.pixels[rows])
             origins[rows] = world.origins.expand_as(world.directions)
@@ -153,7 +172,8 @@ class Trainer:
         """Whether a step has an LPIPS patch."""
         loop = self.config.train
         on = self.lpips is not None and done >= loop.lpips_start
-        return on and step % loop.lpips_every == 0
+        # Without random pixels the patch is all that a step has.
+        return not loop.rays or (on and step % loop.lpips_every == 0)
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Rendered]:
         """The weighted terms of one step.
@@ -167,24 +187,34 @@ class Trainer:
         """
         loop = self.config.train
         with stage("batch"):
-            batch = self.sampler.random(loop.rays, self.generator)
-            with_patch = self.has_patch(step, done)
-            patch = self.sampler.patch(loop.patch, self.generator) if with_patch else None
-            if patch is not None:
-                batch = _joined(batch, patch)
+            batch, shape = self._batch(step, done)
         out = self._render(batch, step)
         ground = torch.zeros(3)
         if loop.random_background:
             ground = torch.rand(3, generator=self.generator)
         target = sent(batch.color + (~batch.mask)[:, None] * ground, self.avatar.device)
         color = out.color + (1.0 - out.opacity)[:, None] * sent(ground, self.avatar.device)
-        shape = None
-        if patch is not None:
-            height = min(loop.patch, self.sampler.height)
-            shape = (height, len(patch.image) // height)
-        terms = self.objective.color(Seen(color, target, shape), self.lpips)
+        terms = self.objective.color(seen_batch(color, target, shape, batch.counted), self.lpips)
+        terms.update(self.objective.density(out, done))
         terms.update(self._deformation_terms(out))
         return terms, out
+
+    def _batch(self, step: int, done: float) -> tuple[PixelBatch, tuple[int, int] | None]:
+        """Pixels of a step, and height and width of the patch, whose rows come last."""
+        loop, focus = self.config.train, self.looks.focus(done)
+        self.look = self.looks.at(done)
+        batch = self.look.random(loop.rays, round(focus * loop.rays), self.generator)
+        if not self.has_patch(step, done):
+            return batch, None
+        sampler = self.look.sampler
+        if focus and self.look.head is not None and self._chance() < focus:
+            sampler = self.look.head
+        patch = sampler.patch(loop.patch, self.generator)
+        height = min(loop.patch, sampler.height)
+        return joined(batch, patch), (height, len(patch.image) // height)
+
+    def _chance(self) -> float:
+        return float(torch.rand((), generator=self.generator))
 
     def _deformation_terms(self, out: Rendered) -> dict[str, Tensor]:
         avatar = self.avatar
@@ -217,8 +247,9 @@ class Trainer:
         with stage("average of the weights"):
             self._average(step)
         self.last = numbers
-        mse = self.last["mse"] / (self.config.loss.mse or 1.0)
-        self.last["psnr"] = -10.0 * math.log10(max(mse, 1e-12))
+        if "mse" in numbers:
+            mse = numbers["mse"] / self.config.loss.mse
+            self.last["psnr"] = -10.0 * math.log10(max(mse, 1e-12))
         return self.last
 
     def _bad_step(self, numbers: dict[str, float]) -> None:
@@ -264,6 +295,7 @@ class Trainer:
                 numbers = self.step(step, done)
             step += 1
             result.iterations = step
+            self._record_round_trips(done)
             result.seconds = time.perf_counter() - start
             result.cpu_seconds = time.process_time() - cpu
             if step % config.log_every == 0 or step == 1:
@@ -276,8 +308,16 @@ class Trainer:
         self.finish()
         return result
 
+    def _record_round_trips(self, done: float) -> None:
+        """Keep a histogram where the next part of the run has begun, and at the end."""
+        found, kept = self.objective.round_trips, self.result.round_trips
+        if found is not None and len(kept) <= int(done * MOMENTS):
+            threshold = self.config.loss.consistency_threshold
+            kept.append(moment(found, threshold, self.result.iterations))
+
     def finish(self) -> None:
         """Use the averaged weights and save them."""
+        self._record_round_trips(1.0)
         if self.config.train.ema and self.result.iterations:
             with torch.no_grad():
                 for value, average in zip(
@@ -310,14 +350,8 @@ class Trainer:
             "losses": {k: v for k, v in numbers.items() if k != "psnr"},
             "psnr": numbers.get("psnr"),
         }
+        if self.objective.round_trips is not None:
+            threshold = self.config.loss.consistency_threshold
+            row["round_trip"] = figures(self.objective.round_trips, threshold)
         with (self.run_folder / "train.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
-
-
-def _joined(a: PixelBatch, b: PixelBatch) -> PixelBatch:
-    return PixelBatch(
-        torch.cat([a.image, b.image]),
-        torch.cat([a.pixels, b.pixels]),
-        torch.cat([a.color, b.color]),
-        torch.cat([a.mask, b.mask]),
-    )
