@@ -74,6 +74,12 @@ class DeformConfig:
     """Width of the residual networks."""
     log2_size: int = 14
     """Rows of a level of the (u, v, t) grid, log2."""
+    time_span: float = 1.0
+    """Part of the grid that the times of the training fill: less is smoother in time."""
+    time_jitter: float = 0.0
+    """Standard deviation of the noise on the times of a training step, in frames."""
+    lr: float = 1.0
+    """Factor of the learning rates of the residuals."""
 
 
 @dataclass(frozen=True)

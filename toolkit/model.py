@@ -159,7 +159,9 @@ class AvatarModel(torch.nn.Module):
         Returns:
             (u, v, t), or (x, y, z, t) in the box of the part.
         """
-        if self.config.deform.input == "uvt":
+        spec = self.config.deform
+        time = (spec.time_span * time).clamp(0.0, 1.0)
+        if spec.input == "uvt":
             return torch.cat([uv, time[:, None]], -1)
         inside = (points.detach() - self.field.lo[part]) / self.field.edge[part, None]
         return torch.cat([inside.clamp(0.0, 1.0), time[:, None]], -1)

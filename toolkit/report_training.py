@@ -62,9 +62,7 @@ def round_trips_section(
             y_label="% of the pairs per mm",
         )
     )
-    lead = (
-        "Samples taken to the canonical body and back, with weights looked up again there."
-    )
+    lead = "Samples taken to the canonical body and back, with weights looked up again there."
     return section("round_trips", "Round trips", lead, f'<div class="charts">{charts}</div>')
 
 

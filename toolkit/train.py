@@ -1,5 +1,6 @@
 """The training loop: batches, losses, optimiser, moving average, log lines and checkpoints."""
 
+import dataclasses
 import json
 import math
 import time
@@ -24,7 +25,7 @@ from .checkpoint import save_weights
 from .determinism import repeatable
 from .device import sent
 from .lpips import LPIPS, load_lpips
-from .model import Rendered
+from .model import FrameInput, Rendered
 from .objective import Objective, seen_batch
 from .optimizer import make_optimizer
 from .resume import forget_state, save_state
@@ -91,6 +92,7 @@ class Trainer:
         # The host draws batches, and so the same ones for every device; see `sent`.
         cameras = [avatar.record.cameras[c].to(host) for c in train.cameras]
         heads = self._heads() if self.config.train.head_focus else None
+        self.inputs = avatar.training_input()
         self.looks = Looks(seen, cameras, heads, self.config.train)
         self.look = self.looks.at(0.0)
         canonical = avatar.canonical_parts() if self.config.loss.consistency else None
@@ -154,15 +156,25 @@ class Trainer:
         with stage("rays"):
             rays, body = self.rays(batch)
             jitter = sent(torch.rand(len(body), generator=self.generator), self.avatar.device)
+            self.inputs = self._inputs()
         return self.avatar.model.render_rays(
             self.scene.parts,
-            self.avatar.training_input(),
+            self.inputs,
             rays,
             body,
             jitter,
             prune=0.0 if self.is_probe(step) or not self.skip.cells else PRUNE,
             skip=self.skip,
         )
+
+    def _inputs(self) -> FrameInput:
+        """Times and codes of the training frames; times with the noise that is asked for."""
+        inputs, jitter = self.avatar.training_input(), self.config.deform.time_jitter
+        if not jitter:
+            return inputs
+        frames = len(inputs.time)
+        noise = torch.randn(frames, generator=self.generator) * jitter / max(frames - 1, 1)
+        return dataclasses.replace(inputs, time=inputs.time + sent(noise, inputs.time.device))
 
     def is_probe(self, step: int) -> bool:
         """Whether a step evaluates learned empty cells too, which refreshes them."""
@@ -219,7 +231,7 @@ class Trainer:
     def _deformation_terms(self, out: Rendered) -> dict[str, Tensor]:
         avatar = self.avatar
         return self.objective.deformation(
-            avatar.model, self.scene.parts, avatar.training_input(), out, self.generator
+            avatar.model, self.scene.parts, self.inputs, out, self.generator
         )
 
     def step(self, step: int, done: float) -> dict[str, float]:

@@ -1,5 +1,6 @@
 """Each term of the objective against slow float64, its switch, and what it costs on nothing."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from training import TINY
 from monopart.geometry.errors import InputError
 from monopart.toolkit.avatar import Avatar, view_of
 from monopart.toolkit.captures import read_capture
+from monopart.toolkit.config import LossConfig
 from monopart.toolkit.losses import (
     absolute_loss,
     color_loss,
@@ -34,7 +36,7 @@ def make(capture: Path, *settings: str) -> Trainer:
 
 def slow_distortion(weights: list[float], depth: list[float], starts: list[int], step: float):
     total = 0.0
-    for first, end in zip(starts, starts[1:], strict=False):
+    for first, end in itertools.pairwise(starts):
         for i in range(first, end):
             total += weights[i] ** 2 * step / 3
             for j in range(first, end):
@@ -103,7 +105,7 @@ def test_nothing_costs_nothing_and_zeros_have_finite_gradients(name: str, rows: 
     assert values.grad is not None and bool(values.grad.isfinite().all())
 
 
-FLAGS = {"l1": "l1_weight", "offset": "", "distortion": "", "elastic": "", "consistency": ""}
+FLAGS = ("l1", "offset", "distortion", "elastic", "consistency")
 
 
 @pytest.mark.parametrize("flag", FLAGS)
@@ -177,7 +179,7 @@ def test_the_forward_deformation_is_for_its_loss_alone(
 
 
 def test_untrained_round_trips_close_where_skinning_can_be_inverted(small_capture: Path) -> None:
-    """Zero residuals: the way back is exact where both ways use the same weights, and only there."""
+    """With zero residuals the way back is exact where both ways have the same weights."""
     trainer = make(small_capture, f"loss.consistency_samples={1 << 30}")
     with torch.no_grad():
         _, out = trainer.losses(0, 0.0)
@@ -198,6 +200,7 @@ def test_untrained_round_trips_close_where_skinning_can_be_inverted(small_captur
 def test_the_consistency_acts_early_and_less_later(small_capture: Path) -> None:
     """On a share of the pairs that a loss can live on, and training makes it smaller."""
     trainer = make(small_capture, "train.seconds=none", "train.iterations=40", "train.ema=0")
+    assert trainer.config.loss.consistency_threshold == LossConfig().consistency_threshold
     trainer.loop()
     moments = trainer.result.round_trips
     assert moments[0]["iteration"] == 1 and moments[-1]["iteration"] == 40
