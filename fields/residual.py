@@ -74,9 +74,9 @@ class ResidualField(torch.nn.Module):
             )
         if self.axes == 3:
             return torch.cat([self.grid(coordinates, part), coordinates], -1)
-        planes = torch.cat([coordinates[:, axes] for axes in _AXES[self.axes]])
-        which = torch.cat([part + self.parts * i for i in range(len(_AXES[self.axes]))])
-        features = self.grid(planes, which).reshape(-1, *part.shape, self.grid.out_features).sum(0)
+        planes = torch.cat([coordinates[:, axes] for axes in _AXES[4]])
+        which = torch.cat([part + self.parts * i for i in range(len(_AXES[4]))])
+        features = self.grid(planes, which).unflatten(0, (len(_AXES[4]), len(part))).sum(0)
         return torch.cat([features, coordinates], -1)
 
     def forward(
