@@ -11,6 +11,7 @@ from monopart.geometry.posed_parts import PosedParts
 
 from .appearance import FrameInput
 from .cache import NO_CACHE, Cache
+from .capacity import allocated
 from .captures.records import CaptureRecord
 from .config import Config
 from .memory import PoseMemory
@@ -42,6 +43,7 @@ class Avatar:
     @classmethod
     def create(cls, record: CaptureRecord, config: Config, cache: Cache = NO_CACHE) -> "Avatar":
         """An untrained avatar on the device of a capture, from the global random state."""
+        config, _ = allocated(config, record, cache=cache)
         frames = record.split("train").frames
         canonical = canonical_body(record)
         poses = torch.stack([record.poses[f].pose for f in frames])

@@ -17,6 +17,7 @@ from monopart.geometry.errors import InputError
 from .animate import as_uint8, pose_of, turntable_views
 from .avatar import Avatar, View
 from .cache import user_cache
+from .capacity import allocated, capacity_lines
 from .captures import check_capture, describe, read_capture
 from .captures.cache import read_pictures
 from .choices import Choices, Extras
@@ -31,7 +32,8 @@ from .results import evaluate_splits, held_out, say, skipping, summary, write_re
 from .resume import load_state
 from .runs import check_free, create_run, next_free, open_run, read_facts, resumable
 from .savings import print_savings, rendering_savings, training_savings
-from .train import Trainer, TrainResult
+from .train import Trainer
+from .train_result import TrainResult
 from .video import save_png, write_video
 
 STRIP_VIEWS, STRIP_SIZE = 8, 384  # turntable of a report: pictures of one turn, pixels
@@ -157,12 +159,14 @@ def _trainer(
         )
         check_capture(record, deep=True, masks=pictures.masks)
         record = record.to(device)
+        config, capacity = allocated(config, record, pictures, cache)
         run = out if resume else create_run(out, config, record)
         torch.manual_seed(config.seed)
         update(0.6, "canonical body")
         avatar = Avatar.create(record, config, cache)
         update(0.8, "posed bodies")
         trainer = Trainer(avatar, run, pictures=pictures)
+        trainer.result.capacity = capacity
         if resume:
             load_state(trainer, run)
             say(f"going on from step {trainer.result.iterations}")
@@ -185,6 +189,8 @@ def _train(trainer: Trainer, stages: Stages) -> bool:
     """Train; True where an interrupt ended it early."""
     name, preset = trainer.avatar.record.name, trainer.config.preset
     say(f"{name}: training preset {preset} on {len(trainer.body_of_image)} images")
+    for line in capacity_lines(trainer.result.capacity):
+        say(line)
     interrupted = _run_loop(trainer)
     stages.seconds["training"] = trainer.result.seconds
     say(f"trained {trainer.result.iterations} steps in {trainer.result.seconds:.1f} s")

@@ -50,6 +50,14 @@ class FieldConfig:
     """Slope k of the distance prior, 1/m; 0 leaves the density to the network."""
     prior_margin: float = 0.015
     """Distance outside the body at which the prior is neutral, metres."""
+    allocation: Literal["data", "uniform"] = "uniform"
+    """Capacity of the parts: from what the training frames show of each, or the same for all."""
+    part_log2_size: tuple[int, ...] = ()
+    """Rows of a level of each part, log2; filled in by the allocation from data."""
+    part_finest: tuple[float, ...] = ()
+    """Edge of the finest cells of each part, metres; filled in by the allocation from data."""
+    use_step: bool = True
+    """Opacity 1 - exp(-density x step) of a sample (eq. 9); off, 1 - exp(-density)."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +65,21 @@ class DeformConfig:
     """Non-rigid deformation (METHOD section 3)."""
 
     residual: bool = True
-    """Backward residual in (u, v, t); off, the deformation is skinning alone."""
+    """Backward residual; off, the deformation is skinning alone."""
+    input: Literal["uvt", "xyzt"] = "uvt"
+    """What the residuals depend on: surface point and time, or place in a part's box and time."""
     scale: float = 0.05
     """Largest residual per axis, metres."""
     hidden: int = 32
     """Width of the residual networks."""
     log2_size: int = 14
     """Rows of a level of the (u, v, t) grid, log2."""
+    time_span: float = 1.0
+    """Part of the grid that the times of the training fill: less is smoother in time."""
+    time_jitter: float = 0.0
+    """Standard deviation of the noise on the times of a training step, in frames."""
+    lr: float = 1.0
+    """Factor of the learning rates of the residuals."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +125,14 @@ class LossConfig:
     """Pairs of a step whose round trip is computed."""
     offset: float = 0.0
     """Weight of the mean residual length, 1/m."""
+    l1: float = 0.0
+    """Weight of the absolute colour error."""
+    distortion: float = 0.0
+    """Weight of the spread of a ray's weights, 1/m; grows to ten times in the last third."""
+    elastic: float = 0.0
+    """Weight of the difference of residuals at neighbouring places, 1/m."""
+    elastic_reach: float = 0.01
+    """Standard deviation of the way to a neighbour, in units of the residual's input."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +177,12 @@ class TrainConfig:
     """Wall-clock seconds between two saved checkpoints."""
     log_every: int = 20
     """Steps between two lines of train.jsonl."""
+    ignore_band: int = 0
+    """Pixels on either side of the edge of the mask that no loss sees."""
+    scales: tuple[float, ...] = ()
+    """Scale of the images in equal stretches of the run, such as 0.3,0.5,0.5; empty: full size."""
+    head_focus: float = 0.0
+    """Part of the pixels and patches of the middle third that is drawn at the head."""
 
 
 @dataclass(frozen=True)
@@ -227,6 +257,10 @@ def _build(kind: Any, data: Any, where: str) -> Any:
 
 def _checked(value: Any, hint: Any, where: str) -> Any:
     choices = typing.get_args(hint)
+    if typing.get_origin(hint) is tuple:
+        if not isinstance(value, list):
+            raise InputError(f"{where}: expected a list, found {value!r}; restore the file")
+        return tuple(_checked(item, choices[0], where) for item in value)
     if typing.get_origin(hint) is Literal:
         good = value in choices
     else:

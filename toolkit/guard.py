@@ -135,8 +135,8 @@ def diagnose(trainer: "Trainer", step: int, done: float, state: Tensor) -> BadSt
     """
     with unchanged(trainer):
         trainer.generator.set_state(state)
-        batch = trainer.draw(step, done)
-        terms, out = trainer.losses_of(batch, step)
+        batch, shape = trainer.draw(step, done)
+        terms, out = trainer.losses_of((batch, shape), step, done)
     named = dict(trainer.avatar.model.named_parameters())
     bad = [n for n, t in terms.items() if not math.isfinite(float(t.detach()))]
     inner = dict(_inner(out))

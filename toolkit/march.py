@@ -81,7 +81,7 @@ def march(
             shaded = _coarse_to_fine(model, bodies, frames, part, prune, lattice, skip)
         else:
             shaded = model.shade(bodies, frames, part, prune, skip)
-        delta = torch.full_like(part.depth, step)
+        delta = torch.full_like(part.depth, model.interval)
         out = composite(shaded.sigma, shaded.color, delta, part.ray_start, part.depth)
         color += light[:, None] * out.color
         depth += light * distance(out)
@@ -121,7 +121,7 @@ def _coarse_to_fine(
     sigma, color = torch.zeros_like(samples.depth), torch.zeros_like(samples.points)
     sigma[looked], color[looked] = first.sigma, first.color
     # Coarse samples before and after each sample: both lie on its ray, whose ends are coarse.
-    taken = sigma[looked] * model.config.geometry.step > EMPTY
+    taken = sigma[looked] * model.interval > EMPTY
     before = looked.long().cumsum(0) - 1
     fine = ~looked & (taken[before] | taken[(before + 1).clamp(max=len(taken) - 1)])
     second = model.shade(bodies, frames, samples.rows(fine), prune, skip)

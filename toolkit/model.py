@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from monopart.fields.distance_prior import DistancePrior
 from monopart.fields.hash_grid import GridSpec
 from monopart.fields.occupancy import PartOccupancy, visible_samples
-from monopart.fields.part_field import PartField, PartFieldSpec
+from monopart.fields.part_field import PartField
 from monopart.fields.part_union import union_by_density
 from monopart.fields.residual import UVT_GRID, ResidualField
 from monopart.fields.volume import Composite, composite
@@ -19,8 +20,9 @@ from monopart.geometry.parts import PartMap, rows_of_parts
 from monopart.geometry.posed_parts import PartPairs, PosedParts, RestPoints
 from monopart.geometry.stages import stage
 
-from .appearance import Appearance, FrameInput, feature_width, fuses
-from .config import Config
+from .appearance import Appearance, FrameInput, fuses
+from .config import Config, DeformConfig
+from .sizes import field_spec
 from .skipping import EVERY, Skipping
 
 HIDDEN = 10.0  # optical depth in front of a sample that hides it: 5e-5 of the light is left
@@ -37,6 +39,7 @@ class Shaded:
         canonical: [M, 3] canonical points of the pairs after the residual.
         residual: [M, 3] backward residuals, or None.
         counts: samples, pairs and colours that were evaluated.
+        place: [M, 3 or 4] what the residuals depend on, in [0, 1], or None.
     """
 
     sigma: Tensor
@@ -45,6 +48,7 @@ class Shaded:
     canonical: Tensor
     residual: Tensor | None
     counts: dict[str, int]
+    place: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,7 @@ class Rendered:
         stats: counts of rays, samples and pairs.
         samples: the samples.
         shaded: their densities and colours.
+        weights: [N] share of each sample in its ray.
     """
 
     color: Tensor
@@ -66,6 +71,7 @@ class Rendered:
     stats: dict[str, int]
     samples: ShellSamples
     shaded: Shaded
+    weights: Tensor | None = None
 
 
 def select(pairs: PartPairs, rows: Tensor, num_parts: int) -> PartPairs:
@@ -101,41 +107,53 @@ class AvatarModel(torch.nn.Module):
         self.num_parts = len(self.parts.names)
         lo, hi = part_boxes(body, canonical, self.parts, config.geometry.canonical_margin)
         spec, deform = config.field, config.deform
-        self.field = PartField(
-            lo,
-            hi,
-            PartFieldSpec(
-                levels=spec.levels,
-                features=spec.features,
-                log2_size=spec.log2_size,
-                base=spec.base,
-                finest=spec.finest,
-                hidden=spec.hidden,
-                geometry=spec.geometry_features,
-                code=feature_width(config.appearance),
-                density_code=config.appearance.density_sees_fusion,
-                sharpness=spec.sharpness,
-            ),
-        )
+        sizes = field_spec(spec, self.num_parts, config.appearance)
+        self.field = PartField(lo, hi, sizes)
         self.prior = None
         if spec.prior_slope:
             self.prior = prior or DistancePrior(canonical.verts, body.faces)
         self.backward_residual = self.forward_residual = None
         if deform.residual:
-            grid = GridSpec(UVT_GRID.levels, 2, deform.log2_size, UVT_GRID.base, UVT_GRID.growth)
-            self.backward_residual = ResidualField(
-                self.num_parts, deform.scale, grid, deform.hidden
-            )
+            self.backward_residual = self._residual_field(deform)
             if config.loss.consistency:
-                self.forward_residual = ResidualField(
-                    self.num_parts, deform.scale, grid, deform.hidden
-                )
+                self.forward_residual = self._residual_field(deform)
         self.codes = None
         if config.appearance.code and not fuses(config.appearance):
             codes = 0.01 * torch.randn(frames, config.appearance.code)
             self.codes = torch.nn.Parameter(codes)
         self.appearance = Appearance(config.appearance, lo, hi, frames)
         self.occupancy = PartOccupancy(self.field.lo, self.field.edge)
+
+    @property
+    def interval(self) -> float:
+        """What a density is multiplied by for the opacity of a sample, metres (1 without unit)."""
+        return self.config.geometry.step if self.config.field.use_step else 1.0
+
+    def _residual_field(self, spec: DeformConfig) -> ResidualField:
+        grid = GridSpec(UVT_GRID.levels, 2, spec.log2_size, UVT_GRID.base, UVT_GRID.growth)
+        axes = 3 if spec.input == "uvt" else 4
+        return ResidualField(self.num_parts, spec.scale, grid, spec.hidden, axes)
+
+    def residual_place(
+        self, points: Tensor, uv: Tensor, part: Tensor, time: Tensor
+    ) -> Float[Tensor, "n c"]:
+        """What a residual depends on (METHOD section 3), in [0, 1].
+
+        Args:
+            points: [N, 3] canonical points, metres.
+            uv: [N, 2] texture coordinates of the surface below.
+            part: [N] part of each point.
+            time: [N] time of each point.
+
+        Returns:
+            (u, v, t), or (x, y, z, t) in the box of the part.
+        """
+        spec = self.config.deform
+        time = (spec.time_span * time).clamp(0.0, 1.0)
+        if spec.input == "uvt":
+            return torch.cat([uv, time[:, None]], -1)
+        inside = (points.detach() - self.field.lo[part]) / self.field.edge[part, None]
+        return torch.cat([inside.clamp(0.0, 1.0), time[:, None]], -1)
 
     def density_of(
         self, points: Tensor, part: Tensor, counts: tuple[int, ...], code: Tensor | None = None
@@ -159,7 +177,7 @@ class AvatarModel(torch.nn.Module):
         cell = self.occupancy.cells_of(rest.points, pairs.part)
         keep = rest.valid
         if prune > 0:
-            step = self.config.geometry.step
+            step = self.interval
             # A cell is empty when one step through it absorbs less than `prune`.
             keep = keep & self.occupancy.keep(cell, prune / step)
             wall = torch.zeros_like(samples.depth)
@@ -197,12 +215,12 @@ class AvatarModel(torch.nn.Module):
             points, uv = rest.points[rows], rest.uv[rows]
             pairs = select(pairs, rows, self.num_parts)
             owner = samples.body[pairs.sample].long()
-        residual = None
+        residual = place = None
         canonical = points
         if self.backward_residual is not None:
             with stage("residual"):
-                uvt = torch.cat([uv, frames.time[owner, None]], -1)
-                residual = self.backward_residual(uvt, pairs.part, pairs.counts)
+                place = self.residual_place(points, uv, pairs.part, frames.time[owner])
+                residual = self.backward_residual(place, pairs.part, pairs.counts)
                 canonical = points + residual
         code = None
         if self.config.appearance.density_sees_fusion:
@@ -232,7 +250,7 @@ class AvatarModel(torch.nn.Module):
             "colors_evaluated": len(rows),
             "samples_reached": len(union.winner),  # one winner for each sample that has a pair
         }
-        return Shaded(union.sigma, color, pairs, canonical, residual, counts)
+        return Shaded(union.sigma, color, pairs, canonical, residual, counts, place)
 
     def render_rays(
         self,
@@ -260,7 +278,7 @@ class AvatarModel(torch.nn.Module):
             samples = bodies.shell.sample(rays, step, body, jitter)
         shaded = self.shade(bodies, frames, samples, prune, skip)
         with stage("compositing"):
-            delta = torch.full_like(samples.depth, step)
+            delta = torch.full_like(samples.depth, self.interval)
             out = composite(shaded.sigma, shaded.color, delta, samples.ray_start, samples.depth)
         stats = {
             "rays": len(rays.directions),
@@ -268,7 +286,7 @@ class AvatarModel(torch.nn.Module):
             "samples_shell": len(samples.depth),
             **shaded.counts,
         }
-        return Rendered(out.color, out.opacity, distance(out), stats, samples, shaded)
+        return Rendered(out.color, out.opacity, distance(out), stats, samples, shaded, out.weights)
 
 
 def distance(out: Composite) -> Tensor:

@@ -6,14 +6,23 @@ import torch
 from torch import Tensor
 
 from monopart.geometry.consistency import consistency_loss
+from monopart.geometry.errors import InputError, MonopartError
+from monopart.geometry.parts import rows_of_parts
 from monopart.geometry.posed_parts import PosedParts
 from monopart.geometry.stages import stage
 
 from .config import Config
 from .device import sent
-from .losses import color_loss, offset_loss, round_trip_distance
+from .losses import (
+    absolute_loss,
+    color_loss,
+    distortion_loss,
+    elastic_loss,
+    offset_loss,
+    round_trip_distance,
+)
 from .lpips import LPIPS
-from .model import AvatarModel, FrameInput, Rendered
+from .model import AvatarModel, FrameInput, Rendered, Shaded
 
 
 @dataclass(frozen=True)
@@ -24,11 +33,30 @@ class Seen:
         color: [N, 3] rendered colours; the rows of a patch come last.
         target: [N, 3] photographed colours.
         patch: height and width of the patch, or None.
+        counted: number of rows that count; in the others color and target are equal.
     """
 
     color: Tensor
     target: Tensor
     patch: tuple[int, int] | None
+    counted: int
+
+
+def seen_batch(
+    color: Tensor, target: Tensor, patch: tuple[int, int] | None, counted: Tensor | None
+) -> Seen:
+    """A batch whose ignored pixels are right by definition, and so have no gradient.
+
+    Args:
+        color: [N, 3] rendered colours.
+        target: [N, 3] photographed colours.
+        patch: height and width of the patch in the last rows, or None.
+        counted: [N] on the host, False where a pixel is ignored; None: all count.
+    """
+    if counted is None:
+        return Seen(color, target, patch, len(color))
+    known = sent(counted, color.device)[:, None]
+    return Seen(torch.where(known, color, target), target, patch, int(counted.sum()))
 
 
 class Objective:
@@ -40,8 +68,16 @@ class Objective:
         Args:
             config: weights and thresholds.
             canonical: the canonical body, for the round trip; None leaves consistency out.
+
+        Raises:
+            InputError: no term compares colours in every step.
         """
+        if not (config.loss.mse or config.loss.l1):
+            raise InputError(
+                "loss.mse, loss.l1: expected a weight above 0 in one of them, found 0 in both"
+            )
         self.config, self.canonical = config, canonical
+        self.round_trips: Tensor | None = None  # distances of the last step, metres
 
     def color(self, seen: Seen, lpips: LPIPS | None) -> dict[str, Tensor]:
         """Terms of colours.
@@ -52,7 +88,12 @@ class Objective:
         """
         spec = self.config.loss
         with stage("loss: colour"):
-            terms = {"mse": spec.mse * color_loss(seen.color, seen.target)}
+            whole = len(seen.color) / max(seen.counted, 1)
+            terms = {}
+            if spec.mse:
+                terms["mse"] = spec.mse * whole * color_loss(seen.color, seen.target)
+            if spec.l1:
+                terms["l1"] = spec.l1 * whole * absolute_loss(seen.color, seen.target)
         if seen.patch is not None and lpips is not None:
             height, width = seen.patch
             rows, shape = len(seen.color) - height * width, (1, height, width, 3)
@@ -60,6 +101,20 @@ class Objective:
                 shown, wanted = seen.color[rows:].reshape(shape), seen.target[rows:].reshape(shape)
                 terms["lpips"] = spec.lpips * lpips(shown.clamp(0, 1), wanted).mean()
         return terms
+
+    def density(self, out: Rendered, done: float) -> dict[str, Tensor]:
+        """Terms of the density along rays.
+
+        Args:
+            out: a rendering of the batch.
+            done: finished part of the run: the weight grows tenfold in the last third.
+        """
+        weight, step = self.config.loss.distortion, self.config.geometry.step
+        if not weight or out.weights is None:
+            return {}
+        with stage("loss: distortion"):
+            spread = distortion_loss(out.weights, out.samples.depth, out.samples.ray_start, step)
+            return {"distortion": weight * late_growth(done) * spread}
 
     def deformation(
         self,
@@ -84,16 +139,45 @@ class Objective:
         if spec.offset:
             with stage("loss: offset"):
                 terms["offset"] = spec.offset * offset_loss(out.shaded.residual)
+        if spec.elastic:
+            with stage("loss: elastic"):
+                terms["elastic"] = spec.elastic * self._elastic(model, out.shaded, generator)
         if self.canonical is not None and model.forward_residual is not None:
             with stage("loss: consistency"):
                 rows = some_rows(len(out.shaded.pairs.sample), spec.consistency_samples, generator)
                 rows = sent(rows, out.color.device)
                 distance = round_trip_distance(model, bodies, self.canonical, frames, out, rows)
+                self.round_trips = distance.detach()
                 cost = consistency_loss(distance, spec.consistency_threshold)
                 terms["consistency"] = spec.consistency * cost
         return terms
 
+    def _elastic(self, model: AvatarModel, shaded: Shaded, generator: torch.Generator) -> Tensor:
+        """Residuals of some pairs against those beside them at the same time."""
+        spec, field = self.config.loss, model.backward_residual
+        if shaded.place is None or shaded.residual is None or field is None:
+            raise MonopartError("elastic loss: expected residuals in the rendering, found none")
+        rows = some_rows(len(shaded.place), spec.consistency_samples, generator)
+        noise = torch.randn(len(rows), shaded.place.shape[1] - 1, generator=generator)
+        rows, noise = sent(rows, shaded.place.device), sent(noise, shaded.place.device)
+        part, place = shaded.pairs.part[rows], shaded.place[rows]
+        beside = (place[:, :-1] + spec.elastic_reach * noise).clamp(0.0, 1.0)
+        beside = torch.cat([beside, place[:, -1:]], -1)
+        neighbour = field(beside, part, rows_of_parts(part, model.num_parts))
+        return elastic_loss(shaded.residual.index_select(0, rows), neighbour)
+
+
+def late_growth(done: float) -> float:
+    """Factor of the distortion loss: 1 until two thirds of the run, then linearly up to 10.
+
+    >>> late_growth(0.5), late_growth(1.0)
+    (1.0, 10.0)
+    """
+    return 1.0 + 9.0 * min(max(3.0 * done - 2.0, 0.0), 1.0)
+
 
 def some_rows(count: int, most: int, generator: torch.Generator) -> Tensor:
-    """At most ``most`` random rows of ``count``, ascending, with repetitions."""
-    return torch.randint(max(count, 1), (min(most, count),), generator=generator).sort()[0]
+    """At most ``most`` rows of ``count``, ascending: all of them, or random ones, maybe twice."""
+    if count <= most:
+        return torch.arange(count)
+    return torch.randint(count, (most,), generator=generator).sort()[0]

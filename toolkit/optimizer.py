@@ -92,17 +92,32 @@ def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam |
     for grid in _grids(model):
         grid.accumulate = sparse
         grid.deterministic = config.train.deterministic
-    tables = [p for n, p in model.named_parameters() if n.endswith("grid.table")]
-    others = [p for n, p in model.named_parameters() if not n.endswith("grid.table")]
-    groups = [
-        {"params": tables, "base_lr": config.train.lr_table},
-        {"params": others, "base_lr": config.train.lr_network},
-    ]
+    loop, slower = config.train, config.deform.lr
+    tables, others = (
+        [(n, p) for n, p in model.named_parameters() if n.endswith("grid.table") == is_table]
+        for is_table in (True, False)
+    )
+    groups = _groups(tables, loop.lr_table, slower)
+    count = len(groups)
+    groups += _groups(others, loop.lr_network, slower)
     rule: Any = {"betas": _RULE.betas, "eps": _RULE.eps}
     if not sparse:
         return Adam(groups, lr=1e-3, fused=True, **rule)
-    others_only = Adam(groups[1:], lr=1e-3, fused=True, **rule)
-    return SplitAdam(RowAdam(groups[:1], rule=_RULE), others_only)
+    others_only = Adam(groups[count:], lr=1e-3, fused=True, **rule)
+    return SplitAdam(RowAdam(groups[:count], rule=_RULE), others_only)
+
+
+def _groups(
+    named: list[tuple[str, torch.nn.Parameter]], rate: float, slower: float
+) -> list[dict[str, Any]]:
+    """One group, or two where the residuals have a rate of their own."""
+    if slower == 1.0:
+        return [{"params": [p for _, p in named], "base_lr": rate}]
+    of_residuals = ("backward_residual.", "forward_residual.")
+    mine = [p for n, p in named if n.startswith(of_residuals)]
+    rest = [p for n, p in named if not n.startswith(of_residuals)]
+    groups = [{"params": rest, "base_lr": rate}, {"params": mine, "base_lr": rate * slower}]
+    return [group for group in groups if group["params"]]
 
 
 def _grids(model: torch.nn.Module) -> Iterator[HashGrid]:

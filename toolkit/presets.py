@@ -4,14 +4,81 @@ import dataclasses
 
 from monopart.geometry.errors import InputError
 
-from .config import Config, DeformConfig, TrainConfig
+from .config import (
+    AppearanceConfig,
+    Config,
+    DeformConfig,
+    FieldConfig,
+    GeometryConfig,
+    LossConfig,
+    TrainConfig,
+)
+
+ALL = 1 << 30  # pairs of a step whose round trip is computed, where all are
+SLOW = TrainConfig(
+    iterations=3000,
+    rays=0,
+    patch=64,
+    lpips_start=0.0,
+    lpips_every=1,
+    lr_table=5e-4,
+    lr_network=5e-4,
+    lr_final=1.0,
+    ema=0.0,
+    occupancy=False,
+)
+"""One patch of one frame a step, Adam at 5e-4, no accelerators (METHOD section 9)."""
+BARE = FieldConfig(prior_slope=0.0, allocation="data")
+"""No density to start from; capacity by part."""
+
+
+def _published() -> dict[str, Config]:
+    """The paper as it is written, and the conventions of the authors' code."""
+    # The appearance of the paper (codes, pose features, fusion) goes here: appearance=...
+    paper = Config(
+        preset="paper",
+        field=BARE,
+        loss=LossConfig(lpips=1.0, consistency_threshold=0.05, consistency_samples=ALL),
+        train=SLOW,
+    )
+    code = dataclasses.replace(
+        paper,
+        preset="code",
+        field=dataclasses.replace(BARE, use_step=False, sharpness=1.0),
+        loss=dataclasses.replace(paper.loss, offset=0.1, distortion=0.1, elastic=0.1),
+        train=dataclasses.replace(SLOW, ignore_band=2, scales=(0.3, 0.5, 0.5), head_focus=0.5),
+    )
+    return {"paper": paper, "code": code}
+
+
+def _baselines() -> dict[str, Config]:
+    """Other methods from the same pieces, with our accelerators: one engine, other models."""
+    # Appearance of these: one code per frame, no pose embedding and no fusion.
+    plain, one_way = AppearanceConfig(), LossConfig(consistency=0.0, offset=0.1)
+    instant = Config(preset="instant_nvr", loss=one_way, appearance=plain)
+    single = Config(
+        preset="single_part",
+        geometry=GeometryConfig(parts="single"),
+        field=FieldConfig(log2_size=17),  # about the rows of five parts of 2^15
+        deform=DeformConfig(input="xyzt"),
+        loss=one_way,
+        appearance=plain,
+    )
+    return {"instant_nvr": instant, "single_part": single}
 
 
 def _presets() -> dict[str, Config]:
     fast = Config(preset="fast")
+    best = Config(
+        preset="best",
+        field=FieldConfig(log2_size=17, allocation="data"),
+        loss=LossConfig(lpips=0.3),
+        train=TrainConfig(seconds=1680.0, lpips_start=0.1, lpips_every=1),
+    )
     tiny = Config(preset="tiny", train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0))
     rigid = Config(preset="rigid", deform=DeformConfig(residual=False))
-    return {"fast": fast, "tiny": tiny, "rigid": rigid}
+    own = {"fast": fast, "best": best, "tiny": tiny, "rigid": rigid}
+    return own | _published() | _baselines()
 
 
 def preset_names() -> tuple[str, ...]:

@@ -14,7 +14,8 @@ import torch
 
 from monopart.geometry.stages import Span, StageRecorder, stage
 
-from .train import PROBE_EVERY, Trainer, TrainResult
+from .train import PROBE_EVERY, Trainer
+from .train_result import TrainResult
 
 WARM_UP = 3 * PROBE_EVERY  # steps before the first timed one: three probes fill the occupancy
 REPEATS = 4  # timed steps of each kind, in a row: one of them averages the weights

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from .train import Trainer
 
 FOLDER = "culprits"
+Drawn = tuple[PixelBatch, tuple[int, int] | None]
 FORMAT = 1
 _BODY = ("v_template", "faces", "weights", "joint_regressor", "shapedirs", "posedirs")
 
@@ -55,10 +56,11 @@ def save_culprit(
     record, train = trainer.avatar.record, trainer.avatar.record.split("train")
     with unchanged(trainer):
         trainer.generator.set_state(state)
-        batch = trainer.draw(bad.step, done)
+        batch, patch = trainer.draw(bad.step, done)
         after = trainer.generator.get_state()
-        rows_of = _touched(trainer, batch, bad.step)
-    tensors = {f"batch.{f.name}": getattr(batch, f.name) for f in dataclasses.fields(batch)}
+        rows_of = _touched(trainer, (batch, patch), bad.step, done)
+    pixels = {f"batch.{f.name}": getattr(batch, f.name) for f in dataclasses.fields(batch)}
+    tensors = {name: value for name, value in pixels.items() if value is not None}
     tensors["generator"] = after
     for name, value in trainer.avatar.model.state_dict().items():
         rows = rows_of.get(name)
@@ -76,6 +78,7 @@ def save_culprit(
         "bad": bad.facts(),
         "done": done,
         "config": json.loads(to_json(trainer.config)),
+        "patch": patch,
         "capture": record.name,
         "cameras": [record.camera_names[c] for c in train.cameras],
         "image_size": record.image_size,
@@ -94,7 +97,7 @@ def _fingerprint(body: BodyModel) -> str:
     return content_key([getattr(body, name).cpu() for name in _BODY])
 
 
-def _touched(trainer: "Trainer", batch: PixelBatch, step: int) -> dict[str, Tensor]:
+def _touched(trainer: "Trainer", drawn: Drawn, step: int, done: float) -> dict[str, Tensor]:
     """Rows of large tensors that a step reads: of hash tables, and cells of the occupancy."""
     model, seen, cells = trainer.avatar.model, {}, []
     grids = {n: m for n, m in model.named_modules() if isinstance(m, HashGrid)}
@@ -111,7 +114,7 @@ def _touched(trainer: "Trainer", batch: PixelBatch, step: int) -> dict[str, Tens
     try:
         model.occupancy.cells_of = cells_of  # type: ignore[method-assign]
         with torch.no_grad():
-            trainer.losses_of(batch, step)
+            trainer.losses_of(drawn, step, done)
     finally:
         del model.occupancy.cells_of
         for hook in hooks:
@@ -157,26 +160,6 @@ class Culprit:
         )
 
 
-class _StoredPixels:
-    """Stands in for the sampler: draws what was drawn, and leaves random numbers as they were."""
-
-    def __init__(self, batch: PixelBatch, size: tuple[int, int], rays: int) -> None:
-        self.batch, self.rays = batch, rays
-        self.height, self.width = size
-
-    def _part(self, rows: slice) -> PixelBatch:
-        fields = dataclasses.fields(self.batch)
-        return PixelBatch(*(getattr(self.batch, f.name)[rows] for f in fields))
-
-    def random(self, count: int, generator: torch.Generator) -> PixelBatch:
-        """The random pixels of the step."""
-        return self._part(slice(0, count))
-
-    def patch(self, size: int, generator: torch.Generator) -> PixelBatch:
-        """Its patch."""
-        return self._part(slice(self.rays, None))
-
-
 def load_culprit(path: Path, body: BodyModel | None = None) -> Culprit:
     """Read what :func:`save_culprit` wrote.
 
@@ -209,7 +192,9 @@ def load_culprit(path: Path, body: BodyModel | None = None) -> Culprit:
         config = config_of(facts["config"], str(path))
         avatar = Avatar.create(record, config)
         avatar.model.load_state_dict(_whole(avatar.model.state_dict(), tensors))
-        batch = PixelBatch(*(tensors[f"batch.{f.name}"] for f in dataclasses.fields(PixelBatch)))
+        names = [f.name for f in dataclasses.fields(PixelBatch)]
+        batch = PixelBatch(*(tensors.get(f"batch.{name}") for name in names))  # type: ignore[arg-type]
+        patch = None if facts["patch"] is None else (int(facts["patch"][0]), int(facts["patch"][1]))
         bad = facts["bad"]
         bad |= {name: tuple(bad[name]) for name in ("terms", "tensors")}
         bad["pixel"] = None if bad["pixel"] is None else tuple(bad["pixel"])
@@ -220,14 +205,24 @@ def load_culprit(path: Path, body: BodyModel | None = None) -> Culprit:
             f"{path}: expected a step that this version wrote, found a difference ({reason}); "
             "replay it with the version that wrote it"
         ) from None
-    count = len(record.split("train").pairs())
-    blank = Pictures(torch.zeros(count, 1, 1, 3, dtype=torch.uint8), torch.ones(count, 1, 1) > 0)
-    trainer = Trainer(avatar, None, pictures=blank)
-    stored: Any = _StoredPixels(batch, record.image_size, config.train.rays)
-    trainer.sampler = stored
+    trainer = Trainer(avatar, None, pictures=_blank(record))
+
+    def stored(step: int, done: float) -> Drawn:
+        trainer.look = trainer.looks.at(done)
+        return batch, patch
+
+    trainer.draw = stored  # type: ignore[method-assign]
     trainer.generator.set_state(tensors["generator"])
     avatar.model.train()
     return Culprit(trainer, found, done, facts["capture"])
+
+
+def _blank(record: CaptureRecord) -> Pictures:
+    """Black pictures that take no memory, a pixel of each on the mask."""
+    size = (len(record.split("train").pairs()), *record.image_size)
+    masks = torch.zeros(size, dtype=torch.bool)
+    masks[:, size[1] // 2, size[2] // 2] = True
+    return Pictures(torch.zeros(1, dtype=torch.uint8).expand(*size, 3), masks)
 
 
 def _whole(now: dict[str, Tensor], tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -39,6 +39,7 @@ from .report_sections import (
     words,
 )
 from .report_style import SCRIPT, STYLE
+from .report_training import capacity_section, round_trips_section
 from .video import Image
 
 __all__ = [
@@ -275,6 +276,8 @@ def report_html(data: ReportData) -> str:
         _images_section(data)
         + metrics_section(data)
         + curves_section(data.curves)
+        + round_trips_section(data.curves, data.round_trips)
+        + capacity_section(data.capacity)
         + timings_section(data.timings)
         + skipping_section(data.skipping)
         + section("capture", "Capture", "", capture)

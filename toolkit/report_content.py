@@ -15,7 +15,7 @@ from .captures import describe
 from .evaluate import Evaluation, ImageScore
 from .report_data import Headline, ReferenceRow, ReportData, SkipRow, Timings, Triple
 from .runs import read_facts
-from .train import TrainResult
+from .train_result import TrainResult
 from .video import Image
 
 TRIPLES = 6
@@ -68,6 +68,8 @@ def report_data(run: Path, avatar: Avatar, results: RunResults) -> ReportData:
         capture=capture_facts(describe(record)),
         headline=headline(results, timings),
         curves=curves,
+        round_trips=training.round_trips,
+        capacity=training.capacity,
         metrics=merged_metrics(run / "metrics.json", results.evaluations),
         triples=[
             t for e in results.evaluations for t in triples(avatar, e, len(results.evaluations))

@@ -107,6 +107,10 @@ class ReportData:
     """Numbers at the top; three to six look best."""
     curves: Sequence[Mapping[str, Any]] = ()
     """Rows of train.jsonl: iteration, seconds, losses {name: value}, psnr, optional val_psnr."""
+    round_trips: Sequence[Mapping[str, Any]] = ()
+    """Of a training.json: round-trip distances at some moments of the training."""
+    capacity: Sequence[Mapping[str, Any]] = ()
+    """Of a training.json: the size of each part's field."""
     metrics: Mapping[str, Mapping[str, Mapping[str, Mapping[str, Number | None]]]] = field(
         default_factory=dict
     )

@@ -19,7 +19,7 @@ from .progress import counted, progress_bar
 from .report import build_report
 from .report_content import RunResults, merged_metrics, report_data
 from .report_data import SkipRow
-from .train import TrainResult
+from .train_result import TrainResult
 
 
 def say(text: str) -> None:

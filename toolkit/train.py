@@ -1,11 +1,10 @@
 """The training loop: batches, losses, optimiser, moving average, log lines and checkpoints."""
 
+import dataclasses
 import json
 import math
 import time
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -19,47 +18,27 @@ from monopart.geometry.stages import stage
 from .avatar import Avatar
 from .captures.cache import Pictures, read_pictures
 from .captures.doubts import picture_doubts
-from .captures.patches import PixelBatch, PixelSampler
+from .captures.patches import Box, PixelBatch, PixelSampler, joined
 from .checkpoint import save_weights
 from .determinism import repeatable
 from .device import sent
 from .guard import diagnose, gradients_are_finite, too_many
 from .lpips import LPIPS, load_lpips
-from .model import Rendered
-from .objective import Objective, Seen
+from .model import FrameInput, Rendered
+from .objective import Objective, seen_batch
 from .optimizer import make_optimizer
 from .replay import FOLDER, save_culprit
 from .resume import forget_state, save_state
+from .round_trips import MOMENTS, figures, moment
+from .schedule import Looks, head_box
 from .skipping import EVERY
+from .train_result import TrainResult
 
 KEPT_CULPRITS = 3  # skipped steps of a run that are diagnosed and written
 PRUNE = 2e-3  # absorption of a step below which a canonical cell counts as empty in training
 PROBE_EVERY = 16  # steps between two renderings without learned skipping, which refresh it
 
 Progress = Callable[[float, dict[str, float]], None]
-
-
-@dataclass
-class TrainResult:
-    """What a training run did.
-
-    Attributes:
-        iterations: steps taken.
-        seconds: wall-clock seconds of the loop.
-        cpu_seconds: processor seconds of the loop, all threads.
-        stats: sums of the counts of rays, samples and pairs over all steps.
-        warnings: what a reader of the report must know.
-        skipped: steps that were left out because a loss or a gradient was not finite.
-        bad_steps: facts of the first of them.
-    """
-
-    iterations: int = 0
-    seconds: float = 0.0
-    cpu_seconds: float = 0.0
-    stats: Counter = field(default_factory=Counter)
-    warnings: list[str] = field(default_factory=list)
-    skipped: int = 0
-    bad_steps: list[dict] = field(default_factory=list)
 
 
 class Trainer:
@@ -84,13 +63,16 @@ class Trainer:
         self.config = avatar.config
         train = avatar.record.split("train")
         seen = pictures or read_pictures(avatar.record, "train", avatar.cache, progress)
-        self.sampler = PixelSampler(seen.images, seen.masks, self.config.train.band)
         self.scene = avatar.scene(train.frames)
         self.body_of_image = torch.tensor([train.frames.index(f) for _, f in train.pairs()])
         self.camera_of_image = torch.tensor([train.cameras.index(c) for c, _ in train.pairs()])
         host = torch.zeros(())
         # The host draws batches, and so the same ones for every device; see `sent`.
-        self.train_cameras = [avatar.record.cameras[c].to(host) for c in train.cameras]
+        cameras = [avatar.record.cameras[c].to(host) for c in train.cameras]
+        heads = self._heads() if self.config.train.head_focus else None
+        self.inputs = avatar.training_input()
+        self.looks = Looks(seen, cameras, heads, self.config.train)
+        self.look = self.looks.at(0.0)
         canonical = avatar.canonical_parts() if self.config.loss.consistency else None
         self.objective = Objective(self.config, canonical)
         self.generator = torch.Generator().manual_seed(self.config.seed)
@@ -101,6 +83,16 @@ class Trainer:
         self.average = [p.detach().clone() for p in avatar.model.parameters()]
         self.skip = EVERY  # what a step leaves out; a comparison switches kinds off
         self.last: dict[str, float] = {}
+
+    @property
+    def sampler(self) -> PixelSampler:
+        """What draws the pixels of a step from now on; see `_look_at`."""
+        return self.look.sampler
+
+    def _heads(self) -> list[Box]:
+        record, verts = self.avatar.record, self.scene.posed.verts_world
+        pairs = zip(self.body_of_image.tolist(), record.split("train").pairs(), strict=True)
+        return [head_box(verts[b], record.body, record.cameras[c]) for b, (c, _) in pairs]
 
     def _load_lpips(self) -> LPIPS | None:
         if not self.config.loss.lpips:
@@ -118,7 +110,7 @@ class Trainer:
         body = self.body_of_image[batch.image]
         camera = self.camera_of_image[batch.image]
         origins, directions = torch.zeros(2, len(body), 3).unbind(0)
-        for index, cam in enumerate(self.train_cameras):
+        for index, cam in enumerate(self.look.cameras):
             rows = camera == index
             world = cam.rays(batch.pixels[rows])
             origins[rows] = world.origins.expand_as(world.directions)
@@ -142,15 +134,26 @@ class Trainer:
         with stage("rays"):
             rays, body = self.rays(batch)
             jitter = sent(torch.rand(len(body), generator=self.generator), self.avatar.device)
+            self.inputs = self._inputs()
         return self.avatar.model.render_rays(
             self.scene.parts,
-            self.avatar.training_input(self._left_out()),
+            self.inputs,
             rays,
             body,
             jitter,
             prune=0.0 if self.is_probe(step) or not self.skip.cells else PRUNE,
             skip=self.skip,
         )
+
+    def _inputs(self) -> FrameInput:
+        """Times and codes of the training frames; times with the noise that is asked for."""
+        inputs = self.avatar.training_input(self._left_out())
+        jitter = self.config.deform.time_jitter
+        if not jitter:
+            return inputs
+        frames = len(inputs.time)
+        noise = torch.randn(frames, generator=self.generator) * jitter / max(frames - 1, 1)
+        return dataclasses.replace(inputs, time=inputs.time + sent(noise, inputs.time.device))
 
     def _left_out(self) -> Tensor | None:
         """Training poses of a step that are treated as unseen; None where nothing asks."""
@@ -168,21 +171,8 @@ class Trainer:
         """Whether a step has an LPIPS patch."""
         loop = self.config.train
         on = self.lpips is not None and done >= loop.lpips_start
-        return on and step % loop.lpips_every == 0
-
-    def draw(self, step: int, done: float) -> PixelBatch:
-        """The pixels of a step: random ones, and behind them those of a patch where it has one.
-
-        Args:
-            step: number of the step, from 0.
-            done: finished part of the run, 0 to 1.
-        """
-        loop = self.config.train
-        with stage("batch"):
-            batch = self.sampler.random(loop.rays, self.generator)
-            if not self.has_patch(step, done):
-                return batch
-            return _joined(batch, self.sampler.patch(loop.patch, self.generator))
+        # Without random pixels the patch is all that a step has.
+        return not loop.rays or (on and step % loop.lpips_every == 0)
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Rendered]:
         """The weighted terms of one step.
@@ -194,35 +184,58 @@ class Trainer:
         Returns:
             Named terms whose sum is minimised, and the rendering.
         """
-        return self.losses_of(self.draw(step, done), step)
+        with stage("batch"):
+            drawn = self.draw(step, done)
+        return self.losses_of(drawn, step, done)
 
-    def losses_of(self, batch: PixelBatch, step: int) -> tuple[dict[str, Tensor], Rendered]:
+    def losses_of(
+        self, drawn: tuple[PixelBatch, tuple[int, int] | None], step: int, done: float
+    ) -> tuple[dict[str, Tensor], Rendered]:
         """As :meth:`losses`, of given pixels.
 
         Args:
-            batch: from :meth:`draw`.
+            drawn: from :meth:`draw`.
             step: number of the step, from 0.
+            done: finished part of the run, 0 to 1.
         """
-        loop = self.config.train
+        batch, shape = drawn
         out = self._render(batch, step)
         ground = torch.zeros(3)
-        if loop.random_background:
+        if self.config.train.random_background:
             ground = torch.rand(3, generator=self.generator)
         target = sent(batch.color + (~batch.mask)[:, None] * ground, self.avatar.device)
         color = out.color + (1.0 - out.opacity)[:, None] * sent(ground, self.avatar.device)
-        shape = None
-        in_patch = len(batch.image) - loop.rays
-        if in_patch:
-            height = min(loop.patch, self.sampler.height)
-            shape = (height, in_patch // height)
-        terms = self.objective.color(Seen(color, target, shape), self.lpips)
+        terms = self.objective.color(seen_batch(color, target, shape, batch.counted), self.lpips)
+        terms.update(self.objective.density(out, done))
         terms.update(self._deformation_terms(out))
         return terms, out
+
+    def draw(self, step: int, done: float) -> tuple[PixelBatch, tuple[int, int] | None]:
+        """Pixels of a step, and height and width of the patch, whose rows come last.
+
+        Args:
+            step: number of the step, from 0.
+            done: finished part of the run, 0 to 1.
+        """
+        loop, focus = self.config.train, self.looks.focus(done)
+        self.look = self.looks.at(done)
+        batch = self.look.random(loop.rays, round(focus * loop.rays), self.generator)
+        if not self.has_patch(step, done):
+            return batch, None
+        sampler = self.look.sampler
+        if focus and self.look.head is not None and self._chance() < focus:
+            sampler = self.look.head
+        patch = sampler.patch(loop.patch, self.generator)
+        height = min(loop.patch, sampler.height)
+        return joined(batch, patch), (height, len(patch.image) // height)
+
+    def _chance(self) -> float:
+        return float(torch.rand((), generator=self.generator))
 
     def _deformation_terms(self, out: Rendered) -> dict[str, Tensor]:
         avatar = self.avatar
         return self.objective.deformation(
-            avatar.model, self.scene.parts, avatar.training_input(), out, self.generator
+            avatar.model, self.scene.parts, self.inputs, out, self.generator
         )
 
     def step(self, step: int, done: float) -> dict[str, float]:
@@ -251,26 +264,26 @@ class Trainer:
         with stage("average of the weights"):
             self._average(step)
         self.last = numbers
-        mse = self.last["mse"] / (self.config.loss.mse or 1.0)
-        self.last["psnr"] = -10.0 * math.log10(max(mse, 1e-12))
+        if "mse" in numbers:
+            mse = numbers["mse"] / self.config.loss.mse
+            self.last["psnr"] = -10.0 * math.log10(max(mse, 1e-12))
         return self.last
 
     def _skip(self, step: int, done: float, before: Tensor) -> dict[str, float]:
         """Leave a step out whose loss or gradient is not finite; end the run after too many."""
         self.optimizer.zero_grad(set_to_none=True)
-        self.result.skipped += 1
-        if self.result.skipped <= KEPT_CULPRITS:
+        result = self.result
+        result.skipped += 1
+        if result.skipped <= KEPT_CULPRITS:
             bad = diagnose(self, step, done, before)
             if self.run_folder is not None:
                 file = save_culprit(self, bad, done, before, self.run_folder / FOLDER)
-                bad = replace(bad, file=f"{FOLDER}/{file.name}")
-            self.result.bad_steps.append(bad.facts())
-            self.result.warnings.append(f"A step was skipped. {bad.text()}.")
-        if self.result.skipped >= self.config.train.max_skipped:
+                bad = dataclasses.replace(bad, file=f"{FOLDER}/{file.name}")
+            result.bad_steps.append(bad.facts())
+            result.warnings.append(f"A step was skipped. {bad.text()}.")
+        if result.skipped >= self.config.train.max_skipped:
             self.checkpoint()
-            raise MonopartError(
-                too_many(self.result.skipped, self.result.bad_steps, self.run_folder)
-            )
+            raise MonopartError(too_many(result.skipped, result.bad_steps, self.run_folder))
         return self.last
 
     @torch.no_grad()
@@ -303,6 +316,7 @@ class Trainer:
                 numbers = self.step(step, done)
             step += 1
             result.iterations = step
+            self._record_round_trips(done)
             result.seconds = time.perf_counter() - start
             result.cpu_seconds = time.process_time() - cpu
             if step % config.log_every == 0 or step == 1:
@@ -315,8 +329,16 @@ class Trainer:
         self.finish()
         return result
 
+    def _record_round_trips(self, done: float) -> None:
+        """Keep a histogram where the next part of the run has begun, and at the end."""
+        found, kept = self.objective.round_trips, self.result.round_trips
+        if found is not None and len(kept) <= int(done * MOMENTS):
+            threshold = self.config.loss.consistency_threshold
+            kept.append(moment(found, threshold, self.result.iterations))
+
     def finish(self) -> None:
         """Use the averaged weights and save them."""
+        self._record_round_trips(1.0)
         if self.config.train.ema and self.result.iterations:
             with torch.no_grad():
                 for value, average in zip(
@@ -349,14 +371,8 @@ class Trainer:
             "losses": {k: v for k, v in numbers.items() if k != "psnr"},
             "psnr": numbers.get("psnr"),
         }
+        if self.objective.round_trips is not None:
+            threshold = self.config.loss.consistency_threshold
+            row["round_trip"] = figures(self.objective.round_trips, threshold)
         with (self.run_folder / "train.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
-
-
-def _joined(a: PixelBatch, b: PixelBatch) -> PixelBatch:
-    return PixelBatch(
-        torch.cat([a.image, b.image]),
-        torch.cat([a.pixels, b.pixels]),
-        torch.cat([a.color, b.color]),
-        torch.cat([a.mask, b.mask]),
-    )

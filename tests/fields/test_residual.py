@@ -5,6 +5,7 @@ import torch
 
 from monopart.fields.hash_grid import GridSpec
 from monopart.fields.residual import UVT_GRID, ResidualField
+from monopart.geometry.errors import InputError
 
 COUNTS = (30, 0, 20)
 PART = torch.tensor([0] * 30 + [2] * 20)
@@ -85,6 +86,35 @@ def test_parts_do_not_share() -> None:
 def test_no_rows() -> None:
     none = torch.zeros(0, dtype=torch.int64)
     assert ResidualField(2)(torch.zeros(0, 3), none, (0, 0)).shape == (0, 3)
+    assert ResidualField(2, axes=4)(torch.zeros(0, 4), none, (0, 0)).shape == (0, 3)
+
+
+def test_four_axes_are_the_sum_of_three_grids() -> None:
+    field = ResidualField(3, axes=4)
+    torch.nn.init.normal_(field.grid.table)
+    torch.nn.init.normal_(field.mlp.weights[-1])
+    xyzt = torch.rand(50, 4)
+    encoded = field.encode(xyzt, PART)
+    assert encoded.shape == (50, field.grid.out_features + 4)
+    for row in (0, 29, 30, 49):
+        x, y, z, t = xyzt[row].tolist()
+        planes = torch.tensor([[x, y, t], [y, z, t], [z, x, t]])
+        whose = PART[row] + 3 * torch.arange(3)
+        expected = field.grid(planes, whose, backend="torch").sum(0)
+        torch.testing.assert_close(encoded[row, :-4], expected, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(encoded[row, -4:], xyzt[row])
+    before = field(xyzt, PART, COUNTS)
+    for axis in range(4):
+        moved = xyzt.clone()
+        moved[:, axis] = 1 - moved[:, axis]
+        assert bool((field(moved, PART, COUNTS) != before).any()), axis
+
+
+def test_wrong_inputs_are_named() -> None:
+    with pytest.raises(InputError, match="axes"):
+        ResidualField(2, axes=5)
+    with pytest.raises(InputError, match="4 columns, found 3"):
+        ResidualField(3, axes=4)(torch.rand(50, 3), PART, COUNTS)
 
 
 def test_the_grid_is_the_method_s() -> None:

@@ -127,8 +127,8 @@ def test_too_many_end_the_run_with_good_weights(capture: Path, tmp_path: Path) -
     good = weights_of(trainer)
     real = trainer.losses_of
 
-    def broken(batch, step):
-        terms, out = real(batch, step)
+    def broken(drawn, step, done):
+        terms, out = real(drawn, step, done)
         return terms | {"mse": terms["mse"] * math.inf}, out
 
     trainer.losses_of = broken  # type: ignore[method-assign]

@@ -21,7 +21,7 @@ from monopart.toolkit.report_content import (
 )
 from monopart.toolkit.report_data import SkipRow, Timings
 from monopart.toolkit.runs import open_run
-from monopart.toolkit.train import TrainResult
+from monopart.toolkit.train_result import TrainResult
 
 
 def _image(frame: int, psnr: float) -> ImageScore:
