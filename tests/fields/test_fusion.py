@@ -71,7 +71,7 @@ def test_the_module_is_the_attention_of_torch() -> None:
 def inputs(codes: int, dim: int, scale: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
     generator = torch.Generator().manual_seed(codes)
     query = scale * torch.randn(15, 2, dim, generator=generator)
-    keys, values = torch.randn(2, 3, codes, 2, dim, generator=generator)
+    keys, values = torch.randn(2, 3, codes, 2, dim, generator=generator).unbind(0)
     return query.requires_grad_(), keys.requires_grad_(), values.requires_grad_()
 
 
@@ -81,8 +81,8 @@ def test_the_kernels_are_their_twin(codes: int, dim: int, scale: float) -> None:
     """Scores of hundreds too: a softmax without care would overflow."""
     data = inputs(codes, dim, scale)
     cotangent = torch.randn(15, 2, dim)
-    exact = tuple(x.detach().double().requires_grad_() for x in data)
-    expected = attend(*exact, COUNTS, "torch")
+    query, keys, values = exact = [x.detach().double().requires_grad_() for x in data]
+    expected = attend(query, keys, values, COUNTS, "torch")
     slopes = torch.autograd.grad(expected, exact, cotangent.double())
     found = attend(*data, COUNTS, "warp")
     bound = 1e-5 * max(1.0, scale / 10)  # rounding of a score of hundreds
