@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .distance_prior import DistancePrior as DistancePrior
     from .frequency import FrequencyEncoding as FrequencyEncoding
+    from .fusion import CodeFusion as CodeFusion
     from .hash_grid import GridSpec as GridSpec
     from .hash_grid import HashGrid as HashGrid
     from .mlp import PartMLP as PartMLP
@@ -21,11 +22,13 @@ if TYPE_CHECKING:
     from .part_field import PartFieldSpec as PartFieldSpec
     from .part_union import Union as Union
     from .part_union import union_by_density as union_by_density
+    from .pose_bank import PoseBank as PoseBank
     from .residual import ResidualField as ResidualField
     from .row_adam import RowAdam as RowAdam
     from .volume import composite as composite
 
 _ROOM = {
+    "CodeFusion": "fusion",
     "DistancePrior": "distance_prior",
     "FrequencyEncoding": "frequency",
     "GridSpec": "hash_grid",
@@ -34,6 +37,7 @@ _ROOM = {
     "PartFieldSpec": "part_field",
     "PartMLP": "mlp",
     "PartOccupancy": "occupancy",
+    "PoseBank": "pose_bank",
     "ResidualField": "residual",
     "RowAdam": "row_adam",
     "Union": "part_union",

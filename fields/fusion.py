@@ -116,7 +116,11 @@ def attend(
         values: values of each part.
         counts: rows of each part.
         backend: ``warp`` (float32, one derivative), ``torch`` (any dtype, any order), ``auto``:
-            on the CPU as elsewhere, on CUDA torch, whose matrix products win there.
+            warp on the CPU, on CUDA torch, whose matrix products serve it there.
+
+    Raises:
+        InputError: counts that do not fit.
+        BackendError: ``warp`` asked for and not able to run.
 
     Returns:
         Per head the mean of the values, weighted by the softmax of query · key / √d.
@@ -125,6 +129,11 @@ def attend(
     >>> attend(torch.rand(4, 2, 3), one, 5 * one, (4,)).unique().tolist()
     [5.0]
     """
+    if len(counts) != len(keys) or sum(counts) != len(query) or min(counts, default=0) < 0:
+        raise InputError(
+            f"attend counts: expected {len(keys)} numbers that add up to {len(query)} rows, found "
+            f"{tuple(counts)}"
+        )
     if backend == "auto" and query.device.type == "cuda":
         backend = "torch"
     if choose_backend(backend, query) == "warp":

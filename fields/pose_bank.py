@@ -125,11 +125,7 @@ class PoseBank(torch.nn.Module):
             InputError: rows and weights that do not fit the parts or each other.
             BackendError: ``warp`` asked for and not able to run.
         """
-        if rows.shape != weights.shape or rows.shape[1] != len(self.lo):
-            raise InputError(
-                f"PoseBank rows, weights: expected equal shapes [bodies, {len(self.lo)}, count], "
-                f"found {tuple(rows.shape)} and {tuple(weights.shape)}"
-            )
+        self._check(part, rows, weights)
         last = self.lines.shape[3] - 1
         place = ((points.detach() - self.lo[part]) / self.extent[part]).clamp(0, 1) * last
         owner = torch.zeros_like(part) if body is None else body
@@ -146,6 +142,22 @@ class PoseBank(torch.nn.Module):
             rows, weights = torch.zeros_like(rows[..., first]), torch.ones_like(weights[..., first])
             return _WarpBank.apply(lines, place, part, owner, rows, weights)
         return _WarpBank.apply(self.lines, place, part, owner, rows, weights)
+
+    def _check(self, part: Tensor, rows: Tensor, weights: Tensor) -> None:
+        parts, poses = self.lines.shape[:2]
+        if rows.shape != weights.shape or rows.shape[1] != parts or rows.shape[2] < 1:
+            raise InputError(
+                f"PoseBank rows, weights: expected equal shapes [bodies, {parts}, 1 or more], "
+                f"found {tuple(rows.shape)} and {tuple(weights.shape)}"
+            )
+        # on the CPU alone: a look at the values would wait for another device
+        for name, index, end in (("part", part, parts), ("rows", rows, poses)):
+            if index.device.type == "cpu" and index.numel() > 0:
+                low, high = (int(v) for v in index.aminmax())
+                if low < 0 or high >= end:
+                    raise InputError(
+                        f"PoseBank {name}: expected indices in [0, {end - 1}], found {low} … {high}"
+                    )
 
     def _forward_torch(
         self, place: Tensor, part: Tensor, owner: Tensor, rows: Tensor, weights: Tensor
@@ -185,7 +197,7 @@ class _WarpBank(torch.autograd.Function):
         shape = torch.tensor([poses, knots, parts], dtype=torch.int32).to(lines.device)
         part, owner, rows = (x.to(torch.int32).contiguous() for x in (part, owner, rows))
         saved = (place.contiguous().view(-1), part, owner, rows.view(-1, count))
-        saved = (*saved, weights.contiguous().view(-1), shape)
+        saved = (*saved, weights.to(lines.dtype).contiguous().view(-1), shape)
         out = lines.new_empty(len(part), 3 * channels)
         args = [view(x) for x in (*saved, lines.view(-1), out.view(-1))]
         launch(bank_kernel(channels), len(part), args, lines)

@@ -20,6 +20,7 @@ _WALK = """
         const float at = place.data[3 * (long long)i + a];
         int cell = (int)at;
         cell = cell > knots - 2 ? knots - 2 : cell;
+        cell = cell < 0 ? 0 : cell;  // NaN stays inside the line
         const float far = at - (float)cell;
         const long long to = (3 * (long long)i + a) * CHANNELS;
         BEGIN

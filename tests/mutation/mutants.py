@@ -325,9 +325,9 @@ TOOLKIT = (
     Mutant(
         "gradients of appearance codes add up in any order",
         "order of a sum",
-        "toolkit/model.py",
-        "frames.code.index_select(0, owner[rows])",
-        "frames.code[owner[rows]]",
+        "toolkit/appearance.py",
+        "frames.code.index_select(0, owner)",
+        "frames.code[owner]",
         _toolkit("determinism"),
     ),
     Mutant(
