@@ -100,12 +100,12 @@ class LossConfig:
     """Weight of LPIPS-VGG on patches (eq. 10)."""
     consistency: float = 1.0
     """Weight of the bidirectional consistency (eq. 3)."""
-    consistency_threshold: float = 0.01
-    """Round-trip distances below this cost nothing, metres."""
+    consistency_threshold: float = 0.002
+    """Round-trip distances below this cost nothing, metres; 0.05 as published acts on no pair."""
     consistency_samples: int = 2048
     """Pairs of a step whose round trip is computed."""
-    offset: float = 0.0
-    """Weight of the mean residual length, 1/m."""
+    offset: float = 1.0
+    """Weight of the mean residual length, 1/m; without it residuals learn frames by heart."""
     l1: float = 0.0
     """Weight of the absolute colour error."""
     distortion: float = 0.0

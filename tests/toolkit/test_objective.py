@@ -199,14 +199,17 @@ def test_untrained_round_trips_close_where_skinning_can_be_inverted(small_captur
 
 def test_the_consistency_acts_early_and_less_later(small_capture: Path) -> None:
     """On a share of the pairs that a loss can live on, and training makes it smaller."""
-    trainer = make(small_capture, "train.seconds=none", "train.iterations=40", "train.ema=0")
+    trainer = make(small_capture, "train.seconds=none", "train.iterations=60", "train.ema=0")
     assert trainer.config.loss.consistency_threshold == LossConfig().consistency_threshold
     trainer.loop()
     moments = trainer.result.round_trips
-    assert moments[0]["iteration"] == 1 and moments[-1]["iteration"] == 40
+    assert moments[0]["iteration"] == 1 and moments[-1]["iteration"] == 60
     assert moments[0]["share"] > 0.01, "the loss acts on nothing"
     assert moments[-1]["p99"] < 0.8 * moments[0]["p99"]
-    assert moments[-1]["share"] < 0.5 * moments[0]["share"]
+    assert moments[-1]["share"] < 0.6 * moments[0]["share"]
+    assert trainer.objective.round_trips is not None
+    published = (trainer.objective.round_trips > 0.05).float().mean()
+    assert float(published) == 0.0, "the threshold of the authors' code would act on nothing"
 
 
 def test_figures_and_histograms_of_round_trips() -> None:
