@@ -101,11 +101,12 @@ class LossConfig:
     consistency: float = 1.0
     """Weight of the bidirectional consistency (eq. 3)."""
     consistency_threshold: float = 0.002
-    """Round-trip distances below this cost nothing, metres; 0.05 as published acts on no pair."""
+    """Round-trip distances below this cost nothing, metres; at larger ones frames are learned
+    by heart."""
     consistency_samples: int = 2048
     """Pairs of a step whose round trip is computed."""
-    offset: float = 1.0
-    """Weight of the mean residual length, 1/m; without it residuals learn frames by heart."""
+    offset: float = 0.0
+    """Weight of the mean residual length, 1/m."""
     l1: float = 0.0
     """Weight of the absolute colour error."""
     distortion: float = 0.0

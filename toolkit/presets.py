@@ -54,7 +54,7 @@ def _published() -> dict[str, Config]:
 def _baselines() -> dict[str, Config]:
     """Other methods from the same pieces, with our accelerators: one engine, other models."""
     # Appearance of these: one code per frame, no pose embedding and no fusion.
-    plain, one_way = AppearanceConfig(), LossConfig(consistency=0.0)
+    plain, one_way = AppearanceConfig(), LossConfig(consistency=0.0, offset=0.1)
     instant = Config(preset="instant_nvr", loss=one_way, appearance=plain)
     single = Config(
         preset="single_part",

@@ -146,7 +146,7 @@ def test_the_distortion_grows_in_the_last_third(small_capture: Path) -> None:
     found = []
     for done in (0.1, 1.0):
         trainer.generator.manual_seed(0)
-        found.append(float(trainer.losses(1, done)[0]["distortion"].detach()))
+        found.append(float(trainer.losses(0, done)[0]["distortion"].detach()))
     assert found[1] == pytest.approx(10 * found[0], rel=1e-5)
 
 
@@ -207,9 +207,6 @@ def test_the_consistency_acts_early_and_less_later(small_capture: Path) -> None:
     assert moments[0]["share"] > 0.01, "the loss acts on nothing"
     assert moments[-1]["p99"] < 0.8 * moments[0]["p99"]
     assert moments[-1]["share"] < 0.6 * moments[0]["share"]
-    assert trainer.objective.round_trips is not None
-    published = (trainer.objective.round_trips > 0.05).float().mean()
-    assert float(published) == 0.0, "the threshold of the authors' code would act on nothing"
 
 
 def test_figures_and_histograms_of_round_trips() -> None:
