@@ -211,10 +211,10 @@ def _spread(picture: np.ndarray) -> np.ndarray:
     """Every pixel gets the part of the nearest pixel that has one; -1 where none has."""
     if not (picture >= 0).any():
         return picture
-    _, nearest = cv2.distanceTransformWithLabels(
+    _, label = cv2.distanceTransformWithLabels(
         (picture < 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    known = picture >= 0
+    known, nearest = picture >= 0, np.asarray(label, np.int64)
     part_of = np.zeros(int(nearest.max()) + 1, np.int32)
     part_of[nearest[known]] = picture[known]
     return part_of[nearest]

@@ -119,8 +119,9 @@ class LossConfig:
     """Weight of LPIPS-VGG on patches (eq. 10)."""
     consistency: float = 1.0
     """Weight of the bidirectional consistency (eq. 3)."""
-    consistency_threshold: float = 0.01
-    """Round-trip distances below this cost nothing, metres."""
+    consistency_threshold: float = 0.002
+    """Round-trip distances below this cost nothing, metres; at larger ones frames are learned
+    by heart."""
     consistency_samples: int = 2048
     """Pairs of a step whose round trip is computed."""
     offset: float = 0.0

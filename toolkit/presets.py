@@ -38,7 +38,7 @@ def _published() -> dict[str, Config]:
     paper = Config(
         preset="paper",
         field=BARE,
-        loss=LossConfig(lpips=1.0, consistency_threshold=0.05, consistency_samples=ALL),
+        loss=LossConfig(lpips=1.0, consistency_threshold=0.05, consistency_samples=ALL, offset=0.0),
         train=SLOW,
     )
     code = dataclasses.replace(

@@ -146,7 +146,7 @@ def test_the_distortion_grows_in_the_last_third(small_capture: Path) -> None:
     found = []
     for done in (0.1, 1.0):
         trainer.generator.manual_seed(0)
-        found.append(float(trainer.losses(1, done)[0]["distortion"].detach()))
+        found.append(float(trainer.losses(0, done)[0]["distortion"].detach()))
     assert found[1] == pytest.approx(10 * found[0], rel=1e-5)
 
 
@@ -199,14 +199,14 @@ def test_untrained_round_trips_close_where_skinning_can_be_inverted(small_captur
 
 def test_the_consistency_acts_early_and_less_later(small_capture: Path) -> None:
     """On a share of the pairs that a loss can live on, and training makes it smaller."""
-    trainer = make(small_capture, "train.seconds=none", "train.iterations=40", "train.ema=0")
+    trainer = make(small_capture, "train.seconds=none", "train.iterations=60", "train.ema=0")
     assert trainer.config.loss.consistency_threshold == LossConfig().consistency_threshold
     trainer.loop()
     moments = trainer.result.round_trips
-    assert moments[0]["iteration"] == 1 and moments[-1]["iteration"] == 40
+    assert moments[0]["iteration"] == 1 and moments[-1]["iteration"] == 60
     assert moments[0]["share"] > 0.01, "the loss acts on nothing"
     assert moments[-1]["p99"] < 0.8 * moments[0]["p99"]
-    assert moments[-1]["share"] < 0.5 * moments[0]["share"]
+    assert moments[-1]["share"] < 0.6 * moments[0]["share"]
 
 
 def test_figures_and_histograms_of_round_trips() -> None:

@@ -19,7 +19,7 @@ from monopart.toolkit.train import Trainer
 
 def small(config: Config, *settings: str) -> Config:
     short = ("field.levels=2", "field.log2_size=8", "field.hidden=16", "deform.hidden=16")
-    few = ("deform.log2_size=8", "train.patch=16", "train.checkpoint_seconds=1000")
+    few = ("deform.log2_size=8", "train.patch=48", "train.checkpoint_seconds=1000")
     return overridden(config, (*short, *few, "loss.lpips=0", *settings))
 
 
