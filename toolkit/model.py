@@ -15,11 +15,13 @@ from monopart.fields.volume import Composite, composite
 from monopart.geometry.body import BodyModel, PosedBody
 from monopart.geometry.cameras import Rays
 from monopart.geometry.culling import ShellSamples
+from monopart.geometry.moving_parts import MovingParts
 from monopart.geometry.parts import PartMap, rows_of_parts
 from monopart.geometry.posed_parts import PartPairs, PosedParts, RestPoints
 from monopart.geometry.stages import stage
 
 from .config import Config
+from .corrections import PoseCorrections
 from .skipping import EVERY, Skipping
 
 HIDDEN = 10.0  # optical depth in front of a sample that hides it: 5e-5 of the light is left
@@ -146,16 +148,26 @@ class AvatarModel(torch.nn.Module):
             codes = 0.01 * torch.randn(frames, config.appearance.code)
             self.codes = torch.nn.Parameter(codes)
         self.occupancy = PartOccupancy(self.field.lo, self.field.edge)
+        self.corrections = None
+        if config.refine.poses:
+            betas = body.num_betas if config.refine.shape else 0
+            self.corrections = PoseCorrections(frames, body.num_joints, betas)
+        self.rigid = False  # leaves the residuals out: the poses are learned first
 
-    def density_of(self, points: Tensor, part: Tensor, counts: tuple[int, ...]) -> tuple:
-        """Density, geometry features and hash features of canonical points sorted by part."""
+    def density_of(
+        self, points: Tensor, part: Tensor, counts: tuple[int, ...], place: Tensor
+    ) -> tuple:
+        """Density, geometry features and hash features of canonical points sorted by part.
+
+        The prior is asked at `place`, the same points with the gradients that it shall have.
+        """
         with stage("hash encode"):
             encoded = self.field.encode(points, part)
         prior: Tensor | float = 0.0
         with stage("density"):
             if self.prior is not None:
                 spec = self.config.field
-                distance = self.prior(points.detach())
+                distance = self.prior(place)
                 prior = (spec.prior_slope * (spec.prior_margin - distance)).clamp(-8.0, 8.0)
             sigma, geometry = self.field.density(encoded, counts, prior)
         return sigma, geometry, encoded
@@ -205,14 +217,19 @@ class AvatarModel(torch.nn.Module):
             points, uv = rest.points[rows], rest.uv[rows]
             pairs = select(pairs, rows, self.num_parts)
             owner = samples.body[pairs.sample].long()
+            if isinstance(bodies, MovingParts):
+                rest = bodies.follow(samples, pairs)
+                points, uv = rest.points, rest.uv
         residual = None
-        canonical = points
-        if self.backward_residual is not None:
+        canonical = place = held = points
+        if self.backward_residual is not None and not self.rigid:
             with stage("residual"):
                 uvt = torch.cat([uv, frames.time[owner, None]], -1)
                 residual = self.backward_residual(uvt, pairs.part, pairs.counts)
-                canonical = points + residual
-        sigma, geometry, encoded = self.density_of(canonical, pairs.part, pairs.counts)
+                # The prior moves poses and no residuals, the deformation terms do the opposite.
+                canonical, place = points + residual, points + residual.detach()
+                held = points.detach() + residual if points.requires_grad else canonical
+        sigma, geometry, encoded = self.density_of(canonical, pairs.part, pairs.counts, place)
         if self.training:
             with stage("occupancy"):
                 self.occupancy.see(cell, sigma)
@@ -234,7 +251,7 @@ class AvatarModel(torch.nn.Module):
             "colors_evaluated": len(rows),
             "samples_reached": len(union.winner),  # one winner for each sample that has a pair
         }
-        return Shaded(union.sigma, color, pairs, canonical, residual, counts)
+        return Shaded(union.sigma, color, pairs, held, residual, counts)
 
     def render_rays(
         self,

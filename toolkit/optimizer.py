@@ -12,6 +12,12 @@ from monopart.fields.row_adam import AdamRule, RowAdam
 from .config import Config
 
 _RULE = AdamRule()
+CORRECTIONS = {
+    "corrections.rotations": 1.0,
+    "corrections.translations": 0.3,
+    "corrections.betas": 10.0,
+}
+"""Parameters of the pose corrections, and their rates in units of `refine.lr`."""
 
 
 class Adam(torch.optim.Adam):
@@ -93,11 +99,16 @@ def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam |
         grid.accumulate = sparse
         grid.deterministic = config.train.deterministic
     tables = [p for n, p in model.named_parameters() if n.endswith("grid.table")]
-    others = [p for n, p in model.named_parameters() if not n.endswith("grid.table")]
+    named = [(n, p) for n, p in model.named_parameters() if not n.endswith("grid.table")]
+    others = [p for n, p in named if n not in CORRECTIONS]
     groups = [
         {"params": tables, "base_lr": config.train.lr_table},
         {"params": others, "base_lr": config.train.lr_network},
     ]
+    for name, share in CORRECTIONS.items():
+        found = [p for n, p in named if n == name]
+        if found:
+            groups.append({"params": found, "base_lr": share * config.refine.lr})
     rule: Any = {"betas": _RULE.betas, "eps": _RULE.eps}
     if not sparse:
         return Adam(groups, lr=1e-3, fused=True, **rule)

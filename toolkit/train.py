@@ -1,5 +1,6 @@
 """The training loop: batches, losses, optimiser, moving average, log lines and checkpoints."""
 
+import dataclasses
 import json
 import math
 import time
@@ -27,6 +28,7 @@ from .losses import color_loss, offset_loss, round_trip_distance
 from .lpips import LPIPS, load_lpips
 from .model import Rendered
 from .optimizer import make_optimizer
+from .refine import Posing, RefinedPoses, with_corrections
 from .resume import forget_state, save_state
 from .skipping import EVERY
 
@@ -80,6 +82,10 @@ class Trainer:
         seen = pictures or read_pictures(avatar.record, "train", avatar.cache, progress)
         self.sampler = PixelSampler(seen.images, seen.masks, self.config.train.band)
         self.scene = avatar.scene(train.frames)
+        self.everyone = self.posing = Posing.of_all(self.scene, avatar.training_input())
+        self.refined = None
+        if avatar.model.corrections is not None:
+            self.refined = RefinedPoses(avatar, train.frames, avatar.model.corrections)
         self.body_of_image = torch.tensor([train.frames.index(f) for _, f in train.pairs()])
         self.camera_of_image = torch.tensor([train.cameras.index(c) for c, _ in train.pairs()])
         host = torch.zeros(())
@@ -116,9 +122,9 @@ class Trainer:
             world = cam.rays(batch.pixels[rows])
             origins[rows] = world.origins.expand_as(world.directions)
             directions[rows] = world.directions
-        body = sent(body, self.avatar.device)
+        body = self.posing.place[sent(body, self.avatar.device)]
         world = Rays(sent(origins, self.avatar.device), sent(directions, self.avatar.device))
-        return self.scene.local_rays(world, body), body
+        return self.posing.scene.local_rays(world, body), body
 
     def warm_up(self) -> None:
         """Compile the kernels by one small step that changes nothing: the clock starts later."""
@@ -136,8 +142,8 @@ class Trainer:
             rays, body = self.rays(batch)
             jitter = sent(torch.rand(len(body), generator=self.generator), self.avatar.device)
         return self.avatar.model.render_rays(
-            self.scene.parts,
-            self.avatar.training_input(),
+            self.posing.scene.parts,
+            self.posing.inputs,
             rays,
             body,
             jitter,
@@ -167,11 +173,14 @@ class Trainer:
         """
         spec, loop = self.config.loss, self.config.train
         with stage("batch"):
-            batch = self.sampler.random(loop.rays, self.generator)
+            refine = self.refined is not None and done >= self.config.refine.start
+            images = self.config.refine.frames if refine else None
+            batch = self.sampler.random(loop.rays, self.generator, images)
             with_patch = self.has_patch(step, done)
             patch = self.sampler.patch(loop.patch, self.generator) if with_patch else None
             if patch is not None:
                 batch = _joined(batch, patch)
+        self._pose(batch, refine, done)
         out = self._render(batch, step)
         ground = torch.zeros(3)
         if loop.random_background:
@@ -187,7 +196,21 @@ class Trainer:
                 seen, wanted = color[loop.rays :].reshape(shape), target[loop.rays :].reshape(shape)
                 terms["lpips"] = spec.lpips * self.lpips(seen.clamp(0, 1), wanted).mean()
         terms.update(self._deformation_terms(out))
+        if refine and self.refined is not None:
+            mask = sent(batch.mask, self.avatar.device)
+            terms.update(self.refined.terms(out.opacity, mask, self.config.refine))
         return terms, out
+
+    def _pose(self, batch: PixelBatch, refine: bool, done: float) -> None:
+        """Choose the bodies of a step: all as they are given, or those of the batch, corrected."""
+        inputs = self.avatar.training_input()
+        self.posing = dataclasses.replace(self.everyone, inputs=inputs)
+        if self.refined is not None:
+            self.avatar.model.rigid = done < self.config.refine.rigid
+        if refine and self.refined is not None:
+            with stage("poses"):
+                seen = self.body_of_image[batch.image].unique()
+                self.posing = self.refined.posing(sent(seen, self.avatar.device), inputs)
 
     def _deformation_terms(self, out: Rendered) -> dict[str, Tensor]:
         spec, terms = self.config.loss, {}
@@ -204,9 +227,9 @@ class Trainer:
                 ).sort()[0]
                 distance = round_trip_distance(
                     self.avatar.model,
-                    self.scene.parts,
+                    self.posing.scene.parts,
                     self.canonical,
-                    self.avatar.training_input(),
+                    self.posing.inputs,
                     out,
                     sent(rows, self.avatar.device),
                 )
@@ -308,7 +331,9 @@ class Trainer:
                 ):
                     value.copy_(average)
         self.avatar.model.eval()
+        self.avatar.model.rigid = False
         self.save()
+        self.avatar = with_corrections(self.avatar)
         if self.run_folder is not None:
             forget_state(self.run_folder)
 
