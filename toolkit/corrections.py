@@ -65,12 +65,24 @@ class PoseCorrections(torch.nn.Module):
         turn = axis_angle_to_rotmat(self.rotations.index_select(0, rows) * self.free)
         given = torch.cat([poses.pose, poses.rotation[:, None]], 1)
         both = rotmat_to_axis_angle(turn @ axis_angle_to_rotmat(given))
-        shape = poses.betas
-        if self.betas is not None:
-            missing = max(len(self.betas) - shape.shape[-1], 0)
-            shape = torch.nn.functional.pad(shape, (0, missing)) + self.betas
         shift = self.translations.index_select(0, rows)
-        return BodyPose(both[:, :-1], shape, both[:, -1], poses.translation + shift)
+        return BodyPose(
+            both[:, :-1], self.shape(poses.betas), both[:, -1], poses.translation + shift
+        )
+
+    def shape(self, betas: Float[Tensor, "*b n"]) -> Float[Tensor, "*b m"]:
+        """Corrected shape coefficients.
+
+        Args:
+            betas: given ones; those that are missing count as zero.
+
+        Returns:
+            At least as many; differentiable.
+        """
+        if self.betas is None:
+            return betas
+        missing = max(len(self.betas) - betas.shape[-1], 0)
+        return torch.nn.functional.pad(betas, (0, missing)) + self.betas
 
     def _values(self) -> Tensor:
         """[F, D] all corrections in units of their expected errors."""

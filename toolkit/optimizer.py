@@ -9,7 +9,7 @@ import torch
 from monopart.fields.hash_grid import HashGrid
 from monopart.fields.row_adam import AdamRule, RowAdam
 
-from .config import Config
+from .config import Config, RefineConfig
 
 _RULE = AdamRule()
 CORRECTIONS = {
@@ -105,15 +105,30 @@ def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam |
         {"params": tables, "base_lr": config.train.lr_table},
         {"params": others, "base_lr": config.train.lr_network},
     ]
-    for name, share in CORRECTIONS.items():
-        found = [p for n, p in named if n == name]
-        if found:
-            groups.append({"params": found, "base_lr": share * config.refine.lr})
+    groups += _pose_groups(dict(named), config.refine)
     rule: Any = {"betas": _RULE.betas, "eps": _RULE.eps}
     if not sparse:
         return Adam(groups, lr=1e-3, fused=True, **rule)
     others_only = Adam(groups[1:], lr=1e-3, fused=True, **rule)
     return SplitAdam(RowAdam(groups[:1], rule=_RULE), others_only)
+
+
+def pose_optimizer(corrections: torch.nn.Module, spec: RefineConfig) -> torch.optim.Adam:
+    """Adam of pose corrections alone, for an avatar that is held.
+
+    Args:
+        corrections: of the frames that are fitted.
+        spec: the rate.
+    """
+    named = {f"corrections.{n}": p for n, p in corrections.named_parameters()}
+    rule: Any = {"betas": _RULE.betas, "eps": _RULE.eps}
+    return Adam(_pose_groups(named, spec), lr=1e-3, fused=True, **rule)
+
+
+def _pose_groups(named: dict[str, torch.nn.Parameter], spec: RefineConfig) -> list[dict[str, Any]]:
+    """Groups of the pose corrections among named parameters; none where there are none."""
+    shares = {named[n]: share for n, share in CORRECTIONS.items() if n in named}
+    return [{"params": [p], "base_lr": share * spec.lr} for p, share in shares.items()]
 
 
 def _grids(model: torch.nn.Module) -> Iterator[HashGrid]:

@@ -1,7 +1,7 @@
 """Bodies whose poses are learned: of the frames of a step only, rebuilt from corrected poses."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,10 +9,12 @@ from torch import Tensor
 
 from monopart.geometry.body import BodyPose
 from monopart.geometry.culling import BodyShell
+from monopart.geometry.errors import InputError
 from monopart.geometry.moving_parts import MovingParts
 from monopart.geometry.posed_parts import PosedParts
 
 from .avatar import Avatar
+from .captures.records import CaptureRecord
 from .config import RefineConfig
 from .corrections import PoseCorrections
 from .memory import PoseMemory
@@ -151,14 +153,16 @@ def with_poses(avatar: Avatar, poses: dict[int, BodyPose]) -> Avatar:
         An avatar with the same model; the poses that it remembers are the new ones.
     """
     given = avatar.given or avatar.record.poses
-    record = dataclasses.replace(avatar.record, poses={**avatar.record.poses, **poses})
+    record = replace(avatar.record, poses={**avatar.record.poses, **poses})
     frames = avatar.memory.frames
     memory = PoseMemory.build(frames, torch.stack([record.poses[f].pose for f in frames]))
-    return dataclasses.replace(avatar, record=record, memory=memory, given=given)
+    return replace(avatar, record=record, memory=memory, given=given)
 
 
 def with_corrections(avatar: Avatar) -> Avatar:
     """A trained avatar with the learned poses of its training frames; itself where none is.
+
+    A learned shape is that of every frame.
 
     Args:
         avatar: the trained person, with the poses as given.
@@ -166,7 +170,12 @@ def with_corrections(avatar: Avatar) -> Avatar:
     fix = avatar.model.corrections
     if fix is None or avatar.given is not None:
         return avatar
-    return with_poses(avatar, RefinedPoses(avatar, avatar.memory.frames, fix).corrected())
+    poses = avatar.record.poses
+    if fix.betas is not None:
+        with torch.no_grad():
+            poses = {f: replace(p, betas=fix.shape(p.betas)) for f, p in poses.items()}
+    refined = RefinedPoses(avatar, avatar.memory.frames, fix).corrected()
+    return with_poses(avatar, {**poses, **refined})
 
 
 def as_given(avatar: Avatar) -> Avatar:
@@ -174,3 +183,35 @@ def as_given(avatar: Avatar) -> Avatar:
     if avatar.given is None:
         return avatar
     return with_poses(avatar, avatar.given)
+
+
+def joint_error(avatar: Avatar, truth: CaptureRecord) -> tuple[float, float]:
+    """Mean distance of the joints of the training frames to other poses of them, not aligned.
+
+    Args:
+        avatar: the trained person with its learned poses.
+        truth: the same capture with the other body track.
+
+    Returns:
+        Metres in the world: at the poses as given, and at the learned ones.
+
+    Raises:
+        InputError: the other track lacks a training frame or is of another body.
+    """
+    frames, body = avatar.memory.frames, avatar.record.body
+    lacking = [f for f in frames if f not in truth.poses]
+    if lacking or truth.body.num_joints != body.num_joints:
+        raise InputError(
+            f"{truth.params}: expected poses of {body.num_joints} joints in frame "
+            f"{(lacking or frames)[0]}, found none; name another track"
+        )
+
+    @torch.no_grad()
+    def joints(poses: dict[int, BodyPose]) -> Tensor:
+        posed = body(stack_poses([poses[f].to(body.v_template) for f in frames]))
+        return posed.to_world(posed.joints)
+
+    exact = joints(truth.poses)
+    tracks = avatar.given or avatar.record.poses, avatar.record.poses
+    before, after = (float((joints(t) - exact).norm(dim=-1).mean()) for t in tracks)
+    return before, after
