@@ -117,7 +117,9 @@ def test_regularisers_are_those_of_plain_loops() -> None:
     assert float(fix.size().detach()) == pytest.approx(size, rel=1e-5)
     assert float(fix.roughness(frames).detach()) == pytest.approx(np.mean(rough), rel=1e-5)
     alone = PoseCorrections(2, 4)
-    assert float(alone.roughness((0, 1)).detach()) == 0.0  # nothing to compare, and a gradient of zero
+    assert (
+        float(alone.roughness((0, 1)).detach()) == 0.0
+    )  # nothing to compare, and a gradient of zero
     alone.roughness((0, 1)).backward()
     assert alone.rotations.grad is not None and not alone.rotations.grad.any()
 
@@ -193,7 +195,7 @@ def test_wrong_poses_become_better_ones(tmp_path: Path) -> None:
     root = write_miniature(tmp_path / "six", frames=6, size=64)
     add_noise(root, 6)
     record = read_capture(root, params=NOISY)
-    config = with_overrides(SMALL, train={"iterations": 150, "rays": 512}, refine={"frames": 4})
+    config = with_overrides(SMALL, train={"iterations": 100, "rays": 384}, refine={"frames": 4})
     torch.manual_seed(0)
     trained = Trainer(Avatar.create(record, config))
     trained.loop()
@@ -233,6 +235,23 @@ def test_a_resumed_refinement_equals_an_unbroken_one(
     assert bool(found["corrections.rotations"].any())
     lines = (tmp_path / "whole" / "train.jsonl").read_text().splitlines()
     assert {"pose_size", "pose_roughness"} <= set(json.loads(lines[-1])["losses"])
+
+
+def test_two_threads_repeat_a_refinement(capture: Path) -> None:
+    def run() -> dict[str, torch.Tensor]:
+        torch.manual_seed(0)
+        config = with_overrides(SMALL, train={"iterations": 3, "rays": 2048})
+        trained = Trainer(Avatar.create(read_capture(capture, params=NOISY), config))
+        trained.loop()
+        return trained.avatar.model.state_dict()
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        first, second = run(), run()
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(first[name], second[name]) for name in first)
 
 
 def test_a_shell_is_kept_until_the_body_leaves_it(capture: Path) -> None:
