@@ -1,4 +1,4 @@
-"""Learned body poses: gradients, regularisers, recovery, off as before, resume, columns of scores."""
+"""Learned body poses: gradients, regularisers, recovery, off as before, resume, scores."""
 
 import dataclasses
 import json
