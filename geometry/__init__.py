@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from .errors import MonopartError as MonopartError
     from .kinematics import KinematicTree as KinematicTree
     from .kinematics import forward_kinematics as forward_kinematics
+    from .moving_parts import MovingParts as MovingParts
     from .parts import PartMap as PartMap
     from .posed_parts import PartPairs as PartPairs
     from .posed_parts import PosedParts as PosedParts
@@ -72,6 +73,7 @@ _ROOM = {
     "InputError": "errors",
     "KinematicTree": "kinematics",
     "MonopartError": "errors",
+    "MovingParts": "moving_parts",
     "PartMap": "parts",
     "PartPairs": "posed_parts",
     "PosedBody": "body",

@@ -6,6 +6,7 @@ capture), and its methods take the index of the body of every ray or point.
 """
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -188,6 +189,30 @@ class BodyShell:
         """The same boxes with every voxel marked for every part: a renderer without skipping."""
         other = copy.copy(self)
         other.grid = torch.full_like(self.grid, (1 << self.num_parts) - 1)
+        return other
+
+    @staticmethod
+    def joined(shells: Sequence["BodyShell"]) -> "BodyShell":
+        """One shell of the bodies of several shells, in order.
+
+        Args:
+            shells: of the same radii, parts and voxels.
+
+        Raises:
+            InputError: no shell, or shells of different voxels or numbers of parts.
+        """
+        kinds = {(s.voxel, s.num_parts) for s in shells}
+        if len(kinds) != 1:
+            raise InputError(
+                f"shells: expected some of one voxel size and number of parts, found {kinds}; "
+                "build them alike"
+            )
+        other = copy.copy(shells[0])
+        other.lo = torch.cat([s.lo for s in shells])
+        other.dims = torch.cat([s.dims for s in shells])
+        other.grid = torch.cat([s.grid for s in shells])
+        cells = other.dims.long().prod(1)
+        other.offset = (cells.cumsum(0) - cells).contiguous()
         return other
 
     def _bodies(self, body: Tensor | int, count: int) -> Tensor:

@@ -33,6 +33,17 @@ class FrameInput:
     rows: Tensor | None = None
     weights: Tensor | None = None
 
+    def of(self, bodies: Tensor) -> "FrameInput":
+        """What is known about some of the bodies.
+
+        Args:
+            bodies: [B'] rows.
+        """
+        code = None if self.code is None else self.code.index_select(0, bodies)
+        if self.rows is None or self.weights is None:
+            return FrameInput(self.time[bodies], code)
+        return FrameInput(self.time[bodies], code, self.rows[bodies], self.weights[bodies])
+
 
 class Appearance(torch.nn.Module):
     """Features of samples that depend on the frame.

@@ -106,7 +106,9 @@ class Train:
 class Eval:
     """Score a run on the held-out images of its capture (protocol strict: masked image, black).
 
-    Scores of all images of a split go into metrics.json; a full evaluation rebuilds report.html.
+    A run that refined body poses is scored at the poses as given, and in columns of their own at
+    refit ones (refit.json). Scores of all images of a split go into metrics.json; a full
+    evaluation rebuilds report.html.
     """
 
     run_folder: RunArg
@@ -121,6 +123,8 @@ class Eval:
     """Folder of the capture, if it has moved."""
     device: Device = "cpu"
     """Where to render; auto is a GPU where there is one."""
+    truth: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: none)")] = None
+    """Folder of exact body poses in the capture: prints the joint error of the training frames."""
 
     def run(self) -> None:
         """Do it."""
@@ -131,7 +135,9 @@ class Eval:
             )
         from . import commands
 
-        commands.evaluate(self.run_folder, self.split, self.capture, self.images, self.device)
+        commands.evaluate(
+            self.run_folder, self.split, self.capture, self.images, self.device, self.truth
+        )
 
 
 @dataclass(frozen=True)

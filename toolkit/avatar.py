@@ -31,6 +31,7 @@ class Avatar:
         memory: poses of the training frames.
         model: the learned part.
         cache: where geometry and images that take long to prepare are kept.
+        given: the poses of the capture as they were read, where `record` holds refined ones.
     """
 
     record: CaptureRecord
@@ -39,6 +40,7 @@ class Avatar:
     memory: PoseMemory
     model: AvatarModel
     cache: Cache = NO_CACHE
+    given: dict[int, BodyPose] | None = None
 
     @classmethod
     def create(cls, record: CaptureRecord, config: Config, cache: Cache = NO_CACHE) -> "Avatar":

@@ -27,8 +27,18 @@ from .explain import print_skipping, why_empty
 from .profile_page import print_profile, write_profile
 from .profiling import profile_training
 from .progress import counted, progress_bar
+from .refine import joint_error
 from .render import Picture, render_view, render_views
-from .results import evaluate_splits, held_out, say, skipping, summary, write_results, write_scores
+from .results import (
+    evaluate_splits,
+    held_out,
+    report_refit,
+    say,
+    skipping,
+    summary,
+    write_results,
+    write_scores,
+)
 from .resume import load_state
 from .runs import check_free, create_run, next_free, open_run, read_facts, resumable
 from .savings import print_savings, rendering_savings, training_savings
@@ -98,6 +108,7 @@ def train(
     size = min(STRIP_SIZE, *avatar.record.image_size)
     with stages.timed("turntable strip"):
         strip = [as_uint8(p.color) for p in turn(avatar, STRIP_VIEWS, size=size)]
+    report_refit(out, avatar, evaluations, extras.images is None)
     report = write_results(out, avatar, result, evaluations, stages.seconds, strip, extras.explain)
     print(f"report: {report}", flush=True)
     if interrupted:
@@ -220,7 +231,12 @@ def _run_loop(trainer: Trainer) -> bool:
 
 
 def evaluate(
-    run: Path, split: str | None, capture: Path | None, images: int | None, device: str = "cpu"
+    run: Path,
+    split: str | None,
+    capture: Path | None,
+    images: int | None,
+    device: str = "cpu",
+    truth: str | None = None,
 ) -> None:
     """Score a run; all images of all splits also rebuild its report.
 
@@ -230,6 +246,7 @@ def evaluate(
         capture: the capture, if it has moved.
         images: images per split; the run folder is then left as it is. None for all.
         device: see :func:`pick_device`.
+        truth: name of a folder of exact body poses: the joint error against it is printed.
     """
     avatar, stages = open_run(run, capture, pick_device(device)), Stages()
     path = run / "training.json"
@@ -238,6 +255,10 @@ def evaluate(
     names = held_out(avatar.record) if split is None else [split]
     with stages.timed("evaluation"):
         evaluations = evaluate_splits(avatar, names, images)
+    report_refit(run, avatar, evaluations, images is None and split is None)
+    if truth is not None:
+        given, learned = joint_error(avatar, read_capture(avatar.record.root, params=truth))
+        print(f"joint error: as given {1e3 * given:.2f} mm | learned {1e3 * learned:.2f} mm")
     if training is not None:
         result, earlier = training
         size = min(STRIP_SIZE, *avatar.record.image_size)

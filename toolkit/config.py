@@ -137,6 +137,34 @@ class LossConfig:
 
 
 @dataclass(frozen=True)
+class RefineConfig:
+    """Body-pose refinement (METHOD section 9), for captures whose poses are estimates."""
+
+    poses: bool = False
+    """Learn corrections of joint rotations, Rh and Th of every training frame."""
+    shape: bool = False
+    """Learn a correction of the shape too, one for all frames; needs `poses`."""
+    frames: int = 12
+    """Training frames that the random pixels of a step come from."""
+    start: float = 0.02
+    """Part of the run after which corrections begin."""
+    rigid: float = 0.5
+    """Part of the run without residuals, which would otherwise explain wrong poses."""
+    lr: float = 2e-3
+    """Learning rate of rotations, radians; translations take 0.3 of it in metres."""
+    prior: float = 1e-5
+    """Weight of the mean squared correction, in units of 0.03 rad, 0.01 m and 1 of shape."""
+    smooth: float = 1e-5
+    """Weight of the mean squared second difference of the corrections in time, same units."""
+    opacity: float = 0.0
+    """Weight of the squared difference of opacity and mask."""
+    margin: float = 0.02
+    """Movement of a body after which its shell is built anew, metres; never changes the image."""
+    refit_steps: int = 200
+    """Steps by which the poses of frames that were not trained on are fitted at test."""
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Optimisation and batches."""
 
@@ -200,6 +228,7 @@ class Config:
     appearance: AppearanceConfig = dataclasses.field(default_factory=AppearanceConfig)
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
+    refine: RefineConfig = dataclasses.field(default_factory=RefineConfig)
 
 
 def to_json(config: Config) -> str:

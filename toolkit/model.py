@@ -16,12 +16,14 @@ from monopart.fields.volume import Composite, composite
 from monopart.geometry.body import BodyModel, PosedBody
 from monopart.geometry.cameras import Rays
 from monopart.geometry.culling import ShellSamples
+from monopart.geometry.moving_parts import MovingParts
 from monopart.geometry.parts import PartMap, rows_of_parts
 from monopart.geometry.posed_parts import PartPairs, PosedParts, RestPoints
 from monopart.geometry.stages import stage
 
 from .appearance import Appearance, FrameInput, fuses
 from .config import Config, DeformConfig
+from .corrections import PoseCorrections
 from .sizes import field_spec
 from .skipping import EVERY, Skipping
 
@@ -49,6 +51,25 @@ class Shaded:
     residual: Tensor | None
     counts: dict[str, int]
     place: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Deformed:
+    """Canonical points after the residual; equal in value, each with the gradients of its use.
+
+    Attributes:
+        canonical: [M, 3] for the fields.
+        asked: [M, 3] for the distance prior: no gradient to the residual.
+        held: [M, 3] for the deformation terms: none to the pose.
+        residual: [M, 3] or None.
+        place: [M, C] where the residual was looked up, or None.
+    """
+
+    canonical: Tensor
+    asked: Tensor
+    held: Tensor
+    residual: Tensor | None
+    place: Tensor | None
 
 
 @dataclass(frozen=True)
@@ -123,6 +144,11 @@ class AvatarModel(torch.nn.Module):
             self.codes = torch.nn.Parameter(codes)
         self.appearance = Appearance(config.appearance, lo, hi, frames)
         self.occupancy = PartOccupancy(self.field.lo, self.field.edge)
+        self.corrections = None
+        if config.refine.poses:
+            betas = body.num_betas if config.refine.shape else 0
+            self.corrections = PoseCorrections(frames, body.num_joints, betas)
+        self.rigid = False  # leaves the residuals out: the poses are learned first
 
     @property
     def interval(self) -> float:
@@ -156,16 +182,24 @@ class AvatarModel(torch.nn.Module):
         return torch.cat([inside.clamp(0.0, 1.0), time[:, None]], -1)
 
     def density_of(
-        self, points: Tensor, part: Tensor, counts: tuple[int, ...], code: Tensor | None = None
+        self,
+        points: Tensor,
+        part: Tensor,
+        counts: tuple[int, ...],
+        asked: Tensor,
+        code: Tensor | None = None,
     ) -> tuple:
-        """Density, geometry features and hash features of canonical points sorted by part."""
+        """Density, geometry features and hash features of canonical points sorted by part.
+
+        The prior is `asked` at the same points with the gradients that it shall have.
+        """
         with stage("hash encode"):
             encoded = self.field.encode(points, part)
         prior: Tensor | float = 0.0
         with stage("density"):
             if self.prior is not None:
                 spec = self.config.field
-                distance = self.prior(points.detach())
+                distance = self.prior(asked)
                 prior = (spec.prior_slope * (spec.prior_margin - distance)).clamp(-8.0, 8.0)
             sigma, geometry = self.field.density(encoded, counts, prior, code)
         return sigma, geometry, encoded
@@ -187,6 +221,16 @@ class AvatarModel(torch.nn.Module):
             keep = keep & seen[pairs.sample]
         rows = torch.nonzero(keep).squeeze(-1)
         return rows, cell[rows]
+
+    def _deformed(self, points: Tensor, uv: Tensor, pairs: PartPairs, time: Tensor) -> Deformed:
+        if self.backward_residual is None or self.rigid:
+            return Deformed(points, points, points, None, None)
+        place = self.residual_place(points, uv, pairs.part, time)
+        residual = self.backward_residual(place, pairs.part, pairs.counts)
+        canonical = points + residual
+        # The prior moves poses and no residuals, the deformation terms do the opposite.
+        held = points.detach() + residual if points.requires_grad else canonical
+        return Deformed(canonical, points + residual.detach(), held, residual, place)
 
     def shade(
         self,
@@ -215,17 +259,18 @@ class AvatarModel(torch.nn.Module):
             points, uv = rest.points[rows], rest.uv[rows]
             pairs = select(pairs, rows, self.num_parts)
             owner = samples.body[pairs.sample].long()
-        residual = place = None
-        canonical = points
-        if self.backward_residual is not None:
-            with stage("residual"):
-                place = self.residual_place(points, uv, pairs.part, frames.time[owner])
-                residual = self.backward_residual(place, pairs.part, pairs.counts)
-                canonical = points + residual
+            if isinstance(bodies, MovingParts):
+                rest = bodies.follow(samples, pairs)
+                points, uv = rest.points, rest.uv
+        with stage("residual"):
+            moved = self._deformed(points, uv, pairs, frames.time[owner])
+        canonical = moved.canonical
         code = None
         if self.config.appearance.density_sees_fusion:
             code = self.appearance(frames, canonical, pairs.part, owner, pairs.counts)
-        sigma, geometry, encoded = self.density_of(canonical, pairs.part, pairs.counts, code)
+        sigma, geometry, encoded = self.density_of(
+            canonical, pairs.part, pairs.counts, moved.asked, code
+        )
         if self.training:
             with stage("occupancy"):
                 self.occupancy.see(cell, sigma)
@@ -250,7 +295,7 @@ class AvatarModel(torch.nn.Module):
             "colors_evaluated": len(rows),
             "samples_reached": len(union.winner),  # one winner for each sample that has a pair
         }
-        return Shaded(union.sigma, color, pairs, canonical, residual, counts, place)
+        return Shaded(union.sigma, color, pairs, moved.held, moved.residual, counts, moved.place)
 
     def render_rays(
         self,

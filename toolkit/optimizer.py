@@ -9,9 +9,15 @@ import torch
 from monopart.fields.hash_grid import HashGrid
 from monopart.fields.row_adam import AdamRule, RowAdam
 
-from .config import Config
+from .config import Config, RefineConfig
 
 _RULE = AdamRule()
+CORRECTIONS = {
+    "corrections.rotations": 1.0,
+    "corrections.translations": 0.3,
+    "corrections.betas": 10.0,
+}
+"""Parameters of the pose corrections, and their rates in units of `refine.lr`."""
 
 
 class Adam(torch.optim.Adam):
@@ -93,13 +99,15 @@ def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam |
         grid.accumulate = sparse
         grid.deterministic = config.train.deterministic
     loop, slower = config.train, config.deform.lr
+    named = [(n, p) for n, p in model.named_parameters() if n not in CORRECTIONS]
     tables, others = (
-        [(n, p) for n, p in model.named_parameters() if n.endswith("grid.table") == is_table]
+        [(n, p) for n, p in named if n.endswith("grid.table") == is_table]
         for is_table in (True, False)
     )
     groups = _groups(tables, loop.lr_table, slower)
     count = len(groups)
     groups += _groups(others, loop.lr_network, slower)
+    groups += _pose_groups(dict(model.named_parameters()), config.refine)
     rule: Any = {"betas": _RULE.betas, "eps": _RULE.eps}
     if not sparse:
         return Adam(groups, lr=1e-3, fused=True, **rule)
@@ -118,6 +126,24 @@ def _groups(
     rest = [p for n, p in named if not n.startswith(of_residuals)]
     groups = [{"params": rest, "base_lr": rate}, {"params": mine, "base_lr": rate * slower}]
     return [group for group in groups if group["params"]]
+
+
+def pose_optimizer(corrections: torch.nn.Module, spec: RefineConfig) -> torch.optim.Adam:
+    """Adam of pose corrections alone, for an avatar that is held.
+
+    Args:
+        corrections: of the frames that are fitted.
+        spec: the rate.
+    """
+    named = {f"corrections.{n}": p for n, p in corrections.named_parameters()}
+    rule: Any = {"betas": _RULE.betas, "eps": _RULE.eps}
+    return Adam(_pose_groups(named, spec), lr=1e-3, fused=True, **rule)
+
+
+def _pose_groups(named: dict[str, torch.nn.Parameter], spec: RefineConfig) -> list[dict[str, Any]]:
+    """Groups of the pose corrections among named parameters; none where there are none."""
+    shares = {named[n]: share for n, share in CORRECTIONS.items() if n in named}
+    return [{"params": [p], "base_lr": share * spec.lr} for p, share in shares.items()]
 
 
 def _grids(model: torch.nn.Module) -> Iterator[HashGrid]:

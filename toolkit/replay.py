@@ -16,7 +16,7 @@ from torch.func import functional_call
 from monopart.fields.hash_grid import HashGrid
 from monopart.geometry.body import BodyModel, BodyPose
 from monopart.geometry.cameras import Camera
-from monopart.geometry.errors import InputError
+from monopart.geometry.errors import InputError, MonopartError
 
 from .atomic import write_bytes
 from .avatar import Avatar
@@ -25,15 +25,42 @@ from .captures.cache import Pictures
 from .captures.patches import PixelBatch
 from .captures.records import CaptureRecord, Split
 from .config import config_of, to_json
-from .guard import BadStep, diagnose, unchanged
+from .guard import BadStep, diagnose, too_many, unchanged
 
 if TYPE_CHECKING:
     from .train import Trainer
 
 FOLDER = "culprits"
+KEPT = 3  # skipped steps of a run that are named and written
 Drawn = tuple[PixelBatch, tuple[int, int] | None]
 FORMAT = 1
 _BODY = ("v_template", "faces", "weights", "joint_regressor", "shapedirs", "posedirs")
+
+
+def note_skipped(trainer: "Trainer", step: int, done: float, state: Tensor) -> None:
+    """Count a step that was not finite; name and keep the first ones; end the run after too many.
+
+    Args:
+        trainer: in the state before the step.
+        step: number of the step.
+        done: finished part of the run.
+        state: random state from before the step.
+
+    Raises:
+        MonopartError: as many as `train.max_skipped`; a checkpoint is written before.
+    """
+    result, run = trainer.result, trainer.run_folder
+    result.skipped += 1
+    if result.skipped <= KEPT:
+        bad = diagnose(trainer, step, done, state)
+        if run is not None:
+            file = save_culprit(trainer, bad, done, state, run / FOLDER)
+            bad = dataclasses.replace(bad, file=f"{FOLDER}/{file.name}")
+        result.bad_steps.append(bad.facts())
+        result.warnings.append(f"A step was skipped. {bad.text()}.")
+    if result.skipped >= trainer.config.train.max_skipped:
+        trainer.checkpoint()
+        raise MonopartError(too_many(result.skipped, result.bad_steps, run))
 
 
 def save_culprit(

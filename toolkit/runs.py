@@ -17,6 +17,7 @@ from .checkpoint import WEIGHTS, load_weights
 from .config import Config, from_json, to_json
 from .device import CPU
 from .environment import environment_facts
+from .refine import with_corrections
 
 
 def is_free(out: Path) -> bool:
@@ -155,4 +156,4 @@ def open_run(run: Path, capture: Path | None = None, device: torch.device = CPU)
     avatar = Avatar.create(record, config, user_cache())
     load_weights(avatar.model, run)
     avatar.model.eval()
-    return avatar
+    return with_corrections(avatar)

@@ -78,7 +78,8 @@ class SceneBodies:
             rays: [R] world rays.
             body: body of each ray, or one for all.
         """
-        rotation, shift = self.posed.rotation[body], self.posed.translation[body]
+        posed = self.posed
+        rotation, shift = posed.rotation.detach()[body], posed.translation.detach()[body]
         origins = rays.origins.expand_as(rays.directions)
         if isinstance(body, int):
             return Rays((origins - shift) @ rotation, rays.directions @ rotation)

@@ -34,18 +34,21 @@ class Look:
     cameras: list[Camera]
     head: PixelSampler | None
 
-    def random(self, count: int, at_head: int, generator: torch.Generator) -> PixelBatch:
+    def random(
+        self, count: int, at_head: int, generator: torch.Generator, images: int | None = None
+    ) -> PixelBatch:
         """Random pixels.
 
         Args:
             count: how many.
             at_head: how many of them at the head.
             generator: source of the choice.
+            images: number of random images from which those come that may lie anywhere; None: all.
         """
         if self.head is None or not at_head:
-            return self.sampler.random(count, generator)
+            return self.sampler.random(count, generator, images)
         few = self.head.random(at_head, generator)
-        return joined(self.sampler.random(count - at_head, generator), few)
+        return joined(self.sampler.random(count - at_head, generator, images), few)
 
 
 class Looks:

@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from monopart.geometry.cameras import Rays
-from monopart.geometry.errors import MonopartError
 from monopart.geometry.stages import stage
 
 from .avatar import Avatar
@@ -22,19 +21,19 @@ from .captures.patches import Box, PixelBatch, PixelSampler, joined
 from .checkpoint import save_weights
 from .determinism import repeatable
 from .device import sent
-from .guard import diagnose, gradients_are_finite, too_many
+from .guard import gradients_are_finite
 from .lpips import LPIPS, load_lpips
 from .model import FrameInput, Rendered
 from .objective import Objective, seen_batch
 from .optimizer import make_optimizer
-from .replay import FOLDER, save_culprit
+from .refine import Posing, RefinedPoses, with_corrections
+from .replay import note_skipped
 from .resume import forget_state, save_state
 from .round_trips import MOMENTS, figures, moment
 from .schedule import Looks, head_box
 from .skipping import EVERY
 from .train_result import TrainResult
 
-KEPT_CULPRITS = 3  # skipped steps of a run that are diagnosed and written
 PRUNE = 2e-3  # absorption of a step below which a canonical cell counts as empty in training
 PROBE_EVERY = 16  # steps between two renderings without learned skipping, which refresh it
 
@@ -64,13 +63,16 @@ class Trainer:
         train = avatar.record.split("train")
         seen = pictures or read_pictures(avatar.record, "train", avatar.cache, progress)
         self.scene = avatar.scene(train.frames)
+        self.everyone = self.posing = Posing.of_all(self.scene, avatar.training_input())
+        self.refined = None
+        if avatar.model.corrections is not None:
+            self.refined = RefinedPoses(avatar, train.frames, avatar.model.corrections)
         self.body_of_image = torch.tensor([train.frames.index(f) for _, f in train.pairs()])
         self.camera_of_image = torch.tensor([train.cameras.index(c) for c, _ in train.pairs()])
         host = torch.zeros(())
         # The host draws batches, and so the same ones for every device; see `sent`.
         cameras = [avatar.record.cameras[c].to(host) for c in train.cameras]
         heads = self._heads() if self.config.train.head_focus else None
-        self.inputs = avatar.training_input()
         self.looks = Looks(seen, cameras, heads, self.config.train)
         self.look = self.looks.at(0.0)
         canonical = avatar.canonical_parts() if self.config.loss.consistency else None
@@ -115,9 +117,9 @@ class Trainer:
             world = cam.rays(batch.pixels[rows])
             origins[rows] = world.origins.expand_as(world.directions)
             directions[rows] = world.directions
-        body = sent(body, self.avatar.device)
+        body = self.posing.place[sent(body, self.avatar.device)]
         world = Rays(sent(origins, self.avatar.device), sent(directions, self.avatar.device))
-        return self.scene.local_rays(world, body), body
+        return self.posing.scene.local_rays(world, body), body
 
     def warm_up(self) -> None:
         """Compile the kernels by one small step that changes nothing: the clock starts later."""
@@ -134,10 +136,9 @@ class Trainer:
         with stage("rays"):
             rays, body = self.rays(batch)
             jitter = sent(torch.rand(len(body), generator=self.generator), self.avatar.device)
-            self.inputs = self._inputs()
         return self.avatar.model.render_rays(
-            self.scene.parts,
-            self.inputs,
+            self.posing.scene.parts,
+            self.posing.inputs,
             rays,
             body,
             jitter,
@@ -199,6 +200,7 @@ class Trainer:
             done: finished part of the run, 0 to 1.
         """
         batch, shape = drawn
+        self._pose(batch, done)
         out = self._render(batch, step)
         ground = torch.zeros(3)
         if self.config.train.random_background:
@@ -208,6 +210,9 @@ class Trainer:
         terms = self.objective.color(seen_batch(color, target, shape, batch.counted), self.lpips)
         terms.update(self.objective.density(out, done))
         terms.update(self._deformation_terms(out))
+        if self.refined is not None and self._refines(done):
+            mask = sent(batch.mask, self.avatar.device)
+            terms.update(self.refined.terms(out.opacity, mask, self.config.refine))
         return terms, out
 
     def draw(self, step: int, done: float) -> tuple[PixelBatch, tuple[int, int] | None]:
@@ -219,7 +224,9 @@ class Trainer:
         """
         loop, focus = self.config.train, self.looks.focus(done)
         self.look = self.looks.at(done)
-        batch = self.look.random(loop.rays, round(focus * loop.rays), self.generator)
+        images = self.config.refine.frames if self._refines(done) else None
+        at_head = round(focus * loop.rays)
+        batch = self.look.random(loop.rays, at_head, self.generator, images)
         if not self.has_patch(step, done):
             return batch, None
         sampler = self.look.sampler
@@ -232,10 +239,25 @@ class Trainer:
     def _chance(self) -> float:
         return float(torch.rand((), generator=self.generator))
 
+    def _refines(self, done: float) -> bool:
+        """Whether poses are learned at a finished part of the run."""
+        return self.refined is not None and done >= self.config.refine.start
+
+    def _pose(self, batch: PixelBatch, done: float) -> None:
+        """Choose the bodies of a step: all as they are given, or those of the batch, corrected."""
+        inputs = self._inputs()
+        self.posing = dataclasses.replace(self.everyone, inputs=inputs)
+        if self.refined is None:
+            return
+        self.avatar.model.rigid = done < self.config.refine.rigid
+        if self._refines(done):
+            with stage("poses"):
+                seen = self.body_of_image[batch.image].unique()
+                self.posing = self.refined.posing(sent(seen, self.avatar.device), inputs)
+
     def _deformation_terms(self, out: Rendered) -> dict[str, Tensor]:
-        avatar = self.avatar
         return self.objective.deformation(
-            avatar.model, self.scene.parts, self.inputs, out, self.generator
+            self.avatar.model, self.posing.scene.parts, self.posing.inputs, out, self.generator
         )
 
     def step(self, step: int, done: float) -> dict[str, float]:
@@ -272,18 +294,7 @@ class Trainer:
     def _skip(self, step: int, done: float, before: Tensor) -> dict[str, float]:
         """Leave a step out whose loss or gradient is not finite; end the run after too many."""
         self.optimizer.zero_grad(set_to_none=True)
-        result = self.result
-        result.skipped += 1
-        if result.skipped <= KEPT_CULPRITS:
-            bad = diagnose(self, step, done, before)
-            if self.run_folder is not None:
-                file = save_culprit(self, bad, done, before, self.run_folder / FOLDER)
-                bad = dataclasses.replace(bad, file=f"{FOLDER}/{file.name}")
-            result.bad_steps.append(bad.facts())
-            result.warnings.append(f"A step was skipped. {bad.text()}.")
-        if result.skipped >= self.config.train.max_skipped:
-            self.checkpoint()
-            raise MonopartError(too_many(result.skipped, result.bad_steps, self.run_folder))
+        note_skipped(self, step, done, before)
         return self.last
 
     @torch.no_grad()
@@ -346,7 +357,9 @@ class Trainer:
                 ):
                     value.copy_(average)
         self.avatar.model.eval()
+        self.avatar.model.rigid = False
         self.save()
+        self.avatar = with_corrections(self.avatar)
         if self.run_folder is not None:
             forget_state(self.run_folder)
 

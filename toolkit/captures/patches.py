@@ -91,9 +91,26 @@ class PixelSampler:
         other._index(chosen)
         return other
 
-    def random(self, count: int, generator: torch.Generator) -> PixelBatch:
-        """Uniformly random pixels of all images, in order: neighbours share the body's memory."""
-        pick = torch.randint(int(self.end[-1]), (count,), generator=generator).sort().values
+    def random(
+        self, count: int, generator: torch.Generator, images: int | None = None
+    ) -> PixelBatch:
+        """Uniformly random pixels, in order: neighbours share the body's memory.
+
+        Args:
+            count: number of pixels.
+            generator: where they are drawn from.
+            images: number of random images from which they come; None is all.
+        """
+        if images is None or images >= len(self.end):
+            pick = torch.randint(int(self.end[-1]), (count,), generator=generator)
+        else:
+            some = torch.randperm(len(self.end), generator=generator)[:images].sort().values
+            first = torch.cat([self.end.new_zeros(1), self.end])[some]
+            ends = (self.end[some] - first).cumsum(0)
+            pick = torch.randint(int(ends[-1]), (count,), generator=generator)
+            row = torch.searchsorted(ends, pick, right=True)
+            pick = pick + (self.end[some] - ends)[row]
+        pick = pick.sort().values
         image = torch.searchsorted(self.end, pick, right=True)
         return self._batch(image, self.pixel[pick].long())
 

@@ -1,0 +1,333 @@
+"""Learned body poses: gradients, regularisers, recovery, off as before, resume, scores."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from miniature import write_miniature
+
+from monopart.geometry.body import BodyPose
+from monopart.geometry.errors import InputError
+from monopart.geometry.rotations import axis_angle_to_rotmat
+from monopart.toolkit.avatar import Avatar, view_of
+from monopart.toolkit.captures import read_capture
+from monopart.toolkit.captures.patches import PixelSampler
+from monopart.toolkit.cli import main
+from monopart.toolkit.corrections import ANGLE, LENGTH, PoseCorrections
+from monopart.toolkit.presets import preset, with_overrides
+from monopart.toolkit.refine import as_given, joint_error, with_corrections
+from monopart.toolkit.refit import column_of, fit_camera
+from monopart.toolkit.render import render_view
+from monopart.toolkit.resume import load_state
+from monopart.toolkit.runs import open_run
+from monopart.toolkit.train import Trainer
+
+NOISY = "new_params_noisy"
+SMALL = with_overrides(
+    preset("fast"),
+    loss={"lpips": 0.0},
+    train={"iterations": 8, "rays": 256, "log_every": 1},
+    field={"log2_size": 9, "levels": 3, "hidden": 16},
+    deform={"log2_size": 8, "hidden": 16},
+    refine={"poses": True, "frames": 2, "start": 0.0, "rigid": 0.5, "refit_steps": 3},
+)
+
+
+def add_noise(root: Path, frames: int) -> None:
+    """A second body track, wrong by about three degrees and two centimetres."""
+    rng = np.random.default_rng(3)
+    shutil.copytree(root / "new_params", root / NOISY)
+    for frame in range(frames):
+        path = root / NOISY / f"{frame}.npy"
+        stored = np.load(path, allow_pickle=True).item()
+        stored["poses"] = stored["poses"] + rng.normal(0, 0.05, (1, 72)).astype(np.float32)
+        stored["poses"][:, :3] = 0
+        stored["Rh"] = stored["Rh"] + rng.normal(0, 0.05, (1, 3)).astype(np.float32)
+        stored["Th"] = stored["Th"] + rng.normal(0, 0.02, (1, 3)).astype(np.float32)
+        box = np.zeros((), dtype=object)
+        box[()] = stored
+        np.save(path, box, allow_pickle=True)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = write_miniature(tmp_path_factory.mktemp("captures") / "noisy", size=48)
+    add_noise(root, 4)
+    return root
+
+
+def trainer(capture: Path, run: Path | None = None, **refine: float | bool) -> Trainer:
+    torch.manual_seed(0)
+    config = with_overrides(SMALL, refine=refine)
+    if run is not None:
+        run.mkdir(exist_ok=True)
+    return Trainer(Avatar.create(read_capture(capture, params=NOISY), config), run)
+
+
+def test_corrections_turn_on_top_of_the_given_rotations() -> None:
+    generator = torch.Generator().manual_seed(1)
+    draw = [torch.randn(s, generator=generator) for s in ((3, 24, 3), (3, 10), (3, 3), (3, 3))]
+    poses = BodyPose(*draw)
+    fix = PoseCorrections(5, 24, 10)
+    for value in fix.parameters():
+        torch.nn.init.normal_(value, std=0.2, generator=generator)
+    rows = torch.tensor([4, 0, 2])
+    found = fix(poses, rows)
+    for n, row in enumerate(rows.tolist()):
+        for joint in range(25):
+            given = poses.pose[n, joint] if joint < 24 else poses.rotation[n]
+            turned = found.pose[n, joint] if joint < 24 else found.rotation[n]
+            change = fix.rotations[row, joint] * (joint > 0)
+            expected = axis_angle_to_rotmat(change) @ axis_angle_to_rotmat(given)
+            torch.testing.assert_close(axis_angle_to_rotmat(turned), expected, atol=3e-6, rtol=0)
+    assert torch.equal(found.translation, poses.translation + fix.translations[rows])
+    assert fix.betas is not None and torch.equal(found.betas, poses.betas + fix.betas)
+    short = dataclasses.replace(poses, betas=poses.betas[:, :4])
+    assert torch.equal(fix(short, rows).betas[:, 4:], fix.betas[4:].expand(3, -1))
+    with pytest.raises(InputError, match="24 joints"):
+        fix(dataclasses.replace(poses, pose=poses.pose[:, :20]), rows)
+    none = PoseCorrections(5, 24)(poses, rows)
+    torch.testing.assert_close(
+        axis_angle_to_rotmat(none.pose), axis_angle_to_rotmat(poses.pose), atol=3e-6, rtol=0
+    )
+
+
+def test_regularisers_are_those_of_plain_loops() -> None:
+    fix = PoseCorrections(6, 4, 2)
+    for value in fix.parameters():
+        torch.nn.init.normal_(value, std=0.1, generator=torch.Generator().manual_seed(2))
+    frames = (0, 1, 2, 5, 8, 10)  # equal gaps around frames 1 and 5 alone
+    angles = fix.rotations.detach().double().numpy() / ANGLE
+    shifts = fix.translations.detach().double().numpy() / LENGTH
+    size, rough = 0.0, []
+    for row in range(6):
+        size += (angles[row, 1:] ** 2).sum() / 6 + (shifts[row] ** 2).sum() / 6
+    for row in range(1, 5):
+        if frames[row + 1] - frames[row] == frames[row] - frames[row - 1]:
+            total = 0.0
+            for track in (angles[:, 1:], shifts):
+                total += ((track[row + 1] - 2 * track[row] + track[row - 1]) ** 2).sum()
+            rough.append(total)
+    assert fix.betas is not None and len(rough) == 2
+    size += (fix.betas.detach().double().numpy() ** 2).sum()
+    assert float(fix.size().detach()) == pytest.approx(size, rel=1e-5)
+    assert float(fix.roughness(frames).detach()) == pytest.approx(np.mean(rough), rel=1e-5)
+    alone = PoseCorrections(2, 4)
+    assert (
+        float(alone.roughness((0, 1)).detach()) == 0.0
+    )  # nothing to compare, and a gradient of zero
+    alone.roughness((0, 1)).backward()
+    assert alone.rotations.grad is not None and not alone.rotations.grad.any()
+
+
+def test_few_images_a_step_and_every_pixel_of_theirs() -> None:
+    masks = torch.zeros(5, 16, 16, dtype=torch.bool)
+    for image in range(5):
+        masks[image, 4 : 6 + image, 4:8] = True
+    sampler = PixelSampler(torch.zeros(5, 16, 16, 3, dtype=torch.uint8), masks, 1)
+    generator = torch.Generator().manual_seed(0)
+    seen = set()
+    for _ in range(10):
+        batch = sampler.random(4000, generator, 2)
+        assert len(batch.image.unique()) == 2 and bool((batch.image.diff() >= 0).all())
+        whole = sampler.random(40000, generator)
+        for image in batch.image.unique().tolist():
+            seen.add(image)
+            found = {tuple(p) for p in batch.pixels[batch.image == image].tolist()}
+            assert found == {tuple(p) for p in whole.pixels[whole.image == image].tolist()}
+    assert seen == set(range(5))
+    same = torch.Generator().manual_seed(4), torch.Generator().manual_seed(4)
+    assert torch.equal(sampler.random(9, same[0], 5).pixels, sampler.random(9, same[1]).pixels)
+
+
+def test_the_gradient_of_the_colours_is_that_of_differences(capture: Path) -> None:
+    trained = trainer(capture)
+    assert trained.refined is not None
+    fix, model = trained.refined.corrections, trained.avatar.model.eval()
+    generator = torch.Generator().manual_seed(6)
+    batch = trained.sampler.random(400, generator)
+    rows = trained.body_of_image[batch.image].unique()
+    weight = torch.randn(400, 3, generator=generator)
+
+    def colour() -> torch.Tensor:
+        assert trained.refined is not None
+        trained.posing = trained.refined.posing(rows, trained.avatar.training_input())
+        rays, body = trained.rays(batch)
+        out = model.render_rays(trained.posing.scene.parts, trained.posing.inputs, rays, body)
+        return (weight * out.color).double().sum() + 5.0 * out.opacity.double().sum()
+
+    colour().backward()
+    for name, eps in (("rotations", 2e-3), ("translations", 1e-3)):
+        value = getattr(fix, name)
+        assert value.grad is not None and bool(value.grad[rows].flatten(1).any(1).all())
+        along = value.grad / value.grad.norm()
+        with torch.no_grad():
+            value += eps * along
+            above = colour()
+            value -= 2 * eps * along
+            below = colour()
+            value += eps * along
+        expected = float(above - below) / (2 * eps)
+        assert float(value.grad.norm()) == pytest.approx(expected, rel=0.1)
+
+
+def test_off_is_the_training_of_before(capture: Path) -> None:
+    """Everything that refinement added is left out: one more draw would change all that follows."""
+    off = trainer(capture, poses=False)
+    assert off.refined is None and off.avatar.model.corrections is None
+    assert not any("corrections" in name for name in off.avatar.model.state_dict())
+    assert len(off.optimizer.param_groups) == 2
+    off.loop()
+    late = trainer(capture, start=1.0, rigid=0.0)  # has corrections and never uses them
+    late.loop()
+    assert late.avatar.given is not None and off.avatar.given is None
+    expected, found = off.avatar.model.state_dict(), late.avatar.model.state_dict()
+    assert all(torch.equal(found[name], value) for name, value in expected.items())
+    assert not found["corrections.rotations"].any()
+
+
+@pytest.mark.slow
+def test_wrong_poses_become_better_ones(tmp_path: Path) -> None:
+    root = write_miniature(tmp_path / "six", frames=6, size=64)
+    add_noise(root, 6)
+    record = read_capture(root, params=NOISY)
+    config = with_overrides(SMALL, train={"iterations": 100, "rays": 384}, refine={"frames": 4})
+    torch.manual_seed(0)
+    trained = Trainer(Avatar.create(record, config))
+    trained.loop()
+    before, after = joint_error(trained.avatar, read_capture(root))
+    assert before > 0.02 and after < 0.75 * before
+    given = joint_error(as_given(trained.avatar), read_capture(root))
+    assert given == pytest.approx((before, before))
+
+
+class _Died(Exception):
+    pass
+
+
+def test_a_resumed_refinement_equals_an_unbroken_one(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = trainer(capture, tmp_path / "whole")
+    whole.loop()
+    broken = trainer(capture, tmp_path / "broken")
+    step = broken.step
+
+    def dying(number: int, done: float) -> dict[str, float]:
+        if number == 5:
+            raise _Died
+        if number == 4:
+            broken.checkpoint()
+        return step(number, done)
+
+    monkeypatch.setattr(broken, "step", dying)
+    with pytest.raises(_Died):
+        broken.loop()
+    again = trainer(capture, tmp_path / "broken")
+    load_state(again, tmp_path / "broken")
+    again.loop()
+    expected, found = whole.avatar.model.state_dict(), again.avatar.model.state_dict()
+    assert all(torch.equal(expected[k], found[k]) for k in expected)
+    assert bool(found["corrections.rotations"].any())
+    lines = (tmp_path / "whole" / "train.jsonl").read_text().splitlines()
+    assert {"pose_size", "pose_roughness"} <= set(json.loads(lines[-1])["losses"])
+
+
+def test_two_threads_repeat_a_refinement(capture: Path) -> None:
+    def run() -> dict[str, torch.Tensor]:
+        torch.manual_seed(0)
+        config = with_overrides(SMALL, train={"iterations": 3, "rays": 2048})
+        trained = Trainer(Avatar.create(read_capture(capture, params=NOISY), config))
+        trained.loop()
+        return trained.avatar.model.state_dict()
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        first, second = run(), run()
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_a_shell_is_kept_until_the_body_leaves_it(capture: Path) -> None:
+    """The picture of a step does not depend on where the shell was built."""
+    trained = trainer(capture)
+    refined, rows = trained.refined, torch.tensor([0, 2])
+    assert refined is not None
+    inputs = trained.avatar.training_input()
+    first = refined.posing(rows, inputs)
+    shells = [refined._shells[row][1] for row in (0, 2)]
+    with torch.no_grad():
+        refined.corrections.rotations[0, 16] += 0.01  # millimetres at the hand
+        refined.corrections.rotations[2, 16] += 0.5
+    second = refined.posing(rows, inputs)
+    assert refined._shells[0][1] is shells[0] and refined._shells[2][1] is not shells[1]
+    assert torch.equal(second.place, torch.tensor([0, 0, 1]))
+    assert second.scene.frames == (0, 2) and first.scene.posed.verts.requires_grad
+    camera = trained.avatar.record.cameras[0]
+    pixels = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * 48
+
+    def picture() -> torch.Tensor:
+        posing = refined.posing(rows, inputs)
+        rays = posing.scene.local_rays(camera.rays(pixels), 0)
+        model = trained.avatar.model.eval()
+        return model.render_rays(posing.scene.parts, posing.inputs, rays).color.detach()
+
+    kept = picture()
+    refined._shells.clear()
+    assert torch.equal(kept, picture()) and bool(kept.any())
+
+
+def test_runs_carry_their_poses_and_scores_have_two_columns(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], short_strip: None
+) -> None:
+    run = tmp_path / "run"
+    settings = ["refine.poses=true", "refine.start=0", "refine.refit_steps=2", "loss.lpips=0"]
+    settings += ["train.rays=128", "field.log2_size=8", "deform.log2_size=8", "refine.shape=true"]
+    command = ["train", str(capture), "--out", str(run), "--params", NOISY, "--iterations", "4"]
+    assert main([*command, "--set", *settings]) is None
+    printed = capsys.readouterr().out
+    for column in ("refit (learned)", "refit (training camera)", "refit (uses the test image)"):
+        assert printed.count(f"| {column} ") >= 1 and "as given" in printed
+    rows = json.loads((run / "refit.json").read_text())["rows"]
+    assert [(r["split"], r["images"]) for r in rows] == [
+        ("novel_view", 2),
+        ("novel_pose", 1),
+        ("novel_pose", 1),
+    ]
+    assert all(r["given"]["full"]["psnr"] != r["refit"]["full"]["psnr"] for r in rows)
+
+    avatar = open_run(run)
+    assert avatar.given is not None and as_given(avatar).record.poses == avatar.given
+    assert with_corrections(avatar) is avatar
+    fix = avatar.model.corrections
+    assert fix is not None and fix.betas is not None
+    moved = avatar.record.poses[1].translation - avatar.given[1].translation
+    torch.testing.assert_close(moved, fix.translations[1].detach(), atol=1e-6, rtol=0)
+    unseen = avatar.record.poses[3]
+    assert torch.equal(unseen.pose, avatar.given[3].pose), "only its shape is the learned one"
+    assert torch.equal(unseen.betas, fix.shape(avatar.given[3].betas).detach())
+    learned = render_view(avatar, view_of(avatar.record, 1, 1)).color
+    given = as_given(avatar)
+    assert not torch.equal(learned, render_view(given, view_of(given.record, 1, 1)).color)
+    assert column_of(avatar, 1, 0) == "refit (learned)"
+    assert fit_camera(avatar.record, 1, 3) == 0
+    only = dataclasses.replace(
+        avatar.record, frames={k: v for k, v in avatar.record.frames.items() if k != (0, 3)}
+    )
+    lonely = dataclasses.replace(avatar, record=only)
+    assert column_of(lonely, 1, 3) == "refit (uses the test image)"
+
+    assert main(["eval", str(run), "--split", "novel_view", "--truth", "new_params"]) is None
+    assert "joint error: as given" in capsys.readouterr().out
+    assert main(["eval", str(run), "--split", "novel_view", "--truth", "none"]) == 2
+    error = joint_error(avatar, read_capture(capture))
+    assert error[0] != error[1] > 0
+    partial = dataclasses.replace(only, poses={0: only.poses[0]})
+    with pytest.raises(InputError, match="frame 1"):
+        joint_error(avatar, partial)
