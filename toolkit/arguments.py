@@ -12,6 +12,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from monopart.geometry.errors import InputError
 
+from .ablate_arguments import Ablate
 from .config import Config
 from .overrides import overridden
 from .presets import preset, preset_names
@@ -263,7 +264,7 @@ class Demo:
         commands.demo(self.capture, self.out, config, self.device)
 
 
-Command = Train | Eval | Render | Turntable | Info | Demo
+Command = Train | Eval | Render | Turntable | Info | Demo | Ablate
 _Commands = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
@@ -271,6 +272,7 @@ _Commands = (
     | Annotated[Turntable, tyro.conf.subcommand("turntable")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Ablate, tyro.conf.subcommand("ablate")]
 )
 
 

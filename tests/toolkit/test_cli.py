@@ -20,7 +20,7 @@ from monopart.toolkit.train import Trainer
 
 pytestmark = pytest.mark.usefixtures("short_strip")
 SNAPSHOT = Path(__file__).parents[1] / "snapshots" / "cli_help.txt"
-COMMANDS = ("train", "eval", "render", "turntable", "info", "demo")
+COMMANDS = ("train", "eval", "render", "turntable", "info", "demo", "ablate")
 FILES = {
     "config.json",
     "capture.json",
