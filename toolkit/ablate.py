@@ -23,7 +23,9 @@ from .atomic import write_json
 from .captures import read_capture
 from .config import Config, from_json
 from .grid import Variant, explicit, same_but_for_name
+from .metrics import Protocol
 from .progress import progress_bar
+from .protocols import held_out_pairs
 from .results import say
 from .resume import STATE
 from .runs import read_facts
@@ -49,6 +51,7 @@ class Plan:
         params: name of the body track; None for the capture's own.
         device: where to train.
         jobs: trainings at a time; each gets its share of the cores.
+        protocols: names of protocols to score under; ``strict`` is always one.
     """
 
     captures: tuple[Path, ...]
@@ -63,6 +66,7 @@ class Plan:
     params: str | None = None
     device: str = "cpu"
     jobs: int = 1
+    protocols: tuple[Protocol, ...] = ("strict",)
 
 
 @dataclass(frozen=True)
@@ -147,6 +151,7 @@ def _cell(
     for option in ("seconds", "iterations", "images", "params"):
         value = getattr(plan, option)
         command += [] if value is None else [f"--{option}", str(value)]
+    command += ["--protocols", *plan.protocols]
     if settings:
         command += ["--set", *settings]
     seeded = resolve(preset, [settings], plan.seconds, plan.iterations, seed)
@@ -178,12 +183,14 @@ def state_of(cell: Cell, plan: Plan) -> str:
             "choose another --out, or remove that folder"
         )
     if (folder / SUMMARY).is_file():
-        images = read_facts(folder / SUMMARY).get("images_asked")
-        if images != plan.images:
-            raise InputError(
-                f"{folder}: expected scores of --images {plan.images}, found {images}; choose "
-                "another --out, or the same --images"
-            )
+        facts = read_facts(folder / SUMMARY)
+        asked = {"images": plan.images, "protocols": list(plan.protocols)}
+        for name, wanted in asked.items():
+            if facts.get(f"{name}_asked") != wanted:
+                raise InputError(
+                    f"{folder}: expected scores of --{name} {wanted}, found "
+                    f"{facts.get(f'{name}_asked')}; choose another --out, or the same --{name}"
+                )
         return "done"
     return "unfinished" if (folder / STATE).is_file() else "broken"
 
@@ -249,7 +256,10 @@ def _check_captures(plan: Plan) -> dict[str, dict[str, int]]:
     found = {}
     for capture in plan.captures:
         record = read_capture(capture, params=plan.params)
-        found[capture.resolve().name] = {n: len(s.pairs()) for n, s in record.splits.items()}
+        held = held_out_pairs(record)
+        if not held:
+            raise InputError(f"{capture}: expected a held-out split, found none; add splits.json")
+        found[capture.resolve().name] = {name: len(pairs) for name, pairs in held.items()}
     return found
 
 
@@ -316,16 +326,20 @@ def summarise(cell: Cell, plan: Plan) -> dict[str, Any]:
     folder = cell.folder
     training, environment = (read_facts(folder / f"{n}.json") for n in ("training", "environment"))
     metrics = read_facts(folder / "metrics.json")
-    counts = {}
+    counts: dict[str, int] = {}
     for split in metrics:
         table = folder / f"images_{split}.csv"
         counts[split] = len(table.read_text(encoding="utf-8").splitlines()) - 1
+    if (folder / "refit.json").is_file():  # scores at refit poses stand beside the others
+        for row in read_facts(folder / "refit.json")["rows"]:
+            metrics[f"{row['split']}@{row['column']}"] = {"strict": row["refit"]}
     summary = {
         "capture": cell.capture.resolve().name,
         "cell": cell.name,
         "seed": cell.seed,
         "command": shlex.join(("monopart", *cell.command)),
         "images_asked": plan.images,
+        "protocols_asked": plan.protocols,
         "images": counts,
         "iterations": training["iterations"],
         "seconds": training["seconds"],

@@ -3,7 +3,7 @@
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -12,6 +12,7 @@ from monopart.geometry.errors import InputError
 from .grid import PAPER
 from .presets import preset_names
 
+ProtocolName = Literal["strict", "legacy", "boxed"]
 _OWN = "(default: the preset's)"
 
 
@@ -49,6 +50,10 @@ class Ablate:
     """Steps of each training; not together with --seconds."""
     images: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
     """Held-out images to score per split, evenly spread; the table says so."""
+    protocols: Annotated[tuple[ProtocolName, ...], arg(metavar="strict|legacy|boxed ...")] = (
+        "strict",
+    )
+    """Protocols to score under; each costs another pass of LPIPS. strict is always one of them."""
     set: Annotated[
         tuple[tuple[str, ...], ...],
         UseAppendAction,
@@ -98,6 +103,7 @@ class Ablate:
             self.params,
             self.device,
             self.jobs,
+            self.protocols,
         )
         print(ablate(plan, self.command(), self.publish))
 
@@ -109,6 +115,7 @@ class Ablate:
         for name in ("base", "seeds", "seconds", "iterations", "images", "params", "jobs"):
             value = getattr(self, name)
             words += [] if value is None else [f"--{name}", str(value)]
+        words += ["--protocols", *self.protocols]
         words += ["--only", *self.only] if self.only else []
         settings = [s for group in self.set for s in group]
         words += ["--set", *settings] if settings else []

@@ -16,8 +16,15 @@ from .grid import FULL, PUBLISHED_ON, Variant
 
 SHOWN = ("full", "box")
 """Regions of the page; the files hold all of them."""
-_DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "mask_iou": 4, "depth_mm": 1}
-_NAMES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "mask_iou": "IoU", "depth_mm": "mm"}
+_DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "mask_iou": 4, "depth_mm": 1, "depth_median_mm": 1}
+_NAMES = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "mask_iou": "IoU",
+    "depth_mm": "depth mm, mean",
+    "depth_median_mm": "median",
+}
 _MISSING = "–"
 
 

@@ -9,7 +9,7 @@ from .grid import FULL, Variant
 
 AS_GIVEN = "as given"
 """Body poses of the evaluated frames as the capture states them."""
-BETTER = {"psnr": 1, "ssim": 1, "lpips": -1, "mask_iou": 1, "depth_mm": -1}
+BETTER = {"psnr": 1, "ssim": 1, "lpips": -1, "mask_iou": 1, "depth_mm": -1, "depth_median_mm": -1}
 """Whether more (1) or less (-1) of a metric is better."""
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from .charts import Series, line_chart
+from .metrics import SHAPE
 from .report_data import Number, ReportData, SkipRow, Timings
 
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4}
@@ -69,8 +70,8 @@ def _score_cell(name: str, value: Number | None) -> str:
     return f'<td class="n">{value:.{_DIGITS.get(name, 4)}f}</td>'
 
 
-def _table(head: Sequence[tuple[str, bool]], rows: Sequence[str]) -> str:
-    """A table; `head` holds (text, is a number)."""
+def table(head: Sequence[tuple[str, bool]], rows: Sequence[str]) -> str:
+    """A table; `head` holds (text, is a number), `rows` finished lines."""
     cells = "".join(f"<th{' class=n' * right}>{escape(text)}</th>" for text, right in head)
     return (
         f'<div class="scroll"><table><thead><tr>{cells}</tr></thead>'
@@ -117,6 +118,8 @@ def metrics_section(data: ReportData) -> str:
     rows, null = [], False
     for split, protocols in data.metrics.items():
         for protocol, regions in protocols.items():
+            if protocol == SHAPE:  # has a table of its own
+                continue
             for region, scores in regions.items():
                 null = null or any(scores.get(n) is None for n in _DIGITS)
                 cells = "".join(_score_cell(n, scores.get(n)) for n in _DIGITS)
@@ -126,7 +129,7 @@ def metrics_section(data: ReportData) -> str:
                 rows.append(f"<tr>{names}{cells}</tr>")
     head = [("Split", False), ("Protocol", False), ("Region", False)]
     body = (
-        _table(head + [(t, True) for t in _UNITS.values()], rows)
+        table(head + [(t, True) for t in _UNITS.values()], rows)
         if rows
         else missing("Not evaluated yet: run monopart eval on this run folder.")
     )
@@ -157,7 +160,7 @@ def _references(data: ReportData) -> str:
         head = [("Method", False), *((t, True) for t in _UNITS.values())]
         title = f"Beside others: {words(split)}, {words(protocol)}, {words(region)}"
         out.append(f'<h3 class="sub">{escape(title)}</h3>')
-        out.append(_table([*head, ("Training", True), ("Source", False)], rows))
+        out.append(table([*head, ("Training", True), ("Source", False)], rows))
     return "".join(out)
 
 
@@ -199,7 +202,7 @@ def timings_section(timings: Timings) -> str:
             for name, value in timings.stages.items()
         ]
         head = [("Stage", False), (f"{seconds_text(total)} in all", True), ("Share", True)]
-        body += '<h3 class="sub">Where the time went</h3>' + _table([*head, ("", False)], rows)
+        body += '<h3 class="sub">Where the time went</h3>' + table([*head, ("", False)], rows)
     else:
         body += missing("No stage was timed.")
     return section("cost", "Time and memory", timings.note, body)
@@ -224,9 +227,9 @@ def skipping_section(rows: Sequence[SkipRow]) -> str:
             f'<td class="note">{escape(row.note)}</td></tr>'
         )
     head = [("Work", False), ("Dense", True), ("Evaluated", True), ("Share", True)]
-    table = _table([*head, ("", False), ("Why", False)], out)
+    body = table([*head, ("", False), ("Why", False)], out)
     lead = "Work that is not done. A row is exact, or says that it is approximate and where."
-    return section("skipped", "What was skipped", lead, table)
+    return section("skipped", "What was skipped", lead, body)
 
 
 def facts(values: Mapping[str, Any]) -> str:
