@@ -151,7 +151,7 @@ def explicit(settings: Sequence[str], base: Config) -> tuple[str, ...]:
             out.append(setting)
             continue
         section, _, entry = path.partition(".")
-        value = getattr(getattr(base, section, None), entry, None)
+        value: Any = getattr(getattr(base, section, None), entry, None)
         try:
             factor = float(text)
         except ValueError:

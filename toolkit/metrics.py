@@ -176,8 +176,8 @@ def score_image(
     scores, inside = _score_full_and_silhouette(pred, target, mask, lpips)
     top, left, bottom, right = mask_box(mask)
     crop = (slice(top, bottom), slice(left, right))
-    box = _score_whole(pred[crop], target[crop], "strict", lpips)
-    return {"full": scores, "box": box, "silhouette": inside}
+    cropped = _score_whole(pred[crop], target[crop], "strict", lpips)
+    return {"full": scores, "box": cropped, "silhouette": inside}
 
 
 def mask_box(mask: Bool[Tensor, "h w"]) -> tuple[int, int, int, int]:

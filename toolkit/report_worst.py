@@ -85,7 +85,7 @@ def contact_sheet(frames: Sequence[WorstFrame]) -> UInt8[np.ndarray, "h w 3"]:
     tiles = []
     for frame in frames:
         tile = np.zeros((frame.image.shape[0] + 24, width, 3), np.uint8)
-        tile[24:, : frame.image.shape[1]] = frame.image
+        tile[24:, : frame.image.shape[1]] = shown(frame.image)
         text = f"{frame.label}  {_psnr(frame.scores)}"
         font = cv2.FONT_HERSHEY_SIMPLEX
         cv2.putText(tile, text, (4, 16), font, 0.42, (255, 255, 255), 1, cv2.LINE_AA)
@@ -113,7 +113,7 @@ def worst_section(frames: Sequence[WorstFrame]) -> str:
     for split in dict.fromkeys(f.split for f in frames):
         body += f'<h3 class="sub">{escape(words(split))}</h3><div class="worst">'
         for frame in (f for f in frames if f.split == split):
-            made = picture(frame.image)
+            made = picture(shown(frame.image))
             text = f"{frame.label}: {_psnr(frame.scores)}"
             body += (
                 f'<figure><img src="{made.uri}" width="{made.size[1]}" height="{made.size[0]}" '
