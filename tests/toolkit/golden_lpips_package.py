@@ -3,8 +3,8 @@
     pip install --no-deps lpips==0.1.4 torchvision tqdm
     python tests/toolkit/golden_lpips_package.py
 
-The package's own heads, version 0.1, are taken as it ships them. The backbone that it would download
-is the VGG16 that the toolkit found on this machine; tests check it by other figures.
+The package's own heads, version 0.1, are taken as it ships them. The backbone that it would
+download is the VGG16 that the toolkit found on this machine; tests check it by other figures.
 """
 
 import json
