@@ -329,6 +329,8 @@ def summarise(cell: Cell, plan: Plan) -> dict[str, Any]:
     counts: dict[str, int] = {}
     for split in metrics:
         table = folder / f"images_{split}.csv"
+        if not table.is_file():
+            raise InputError(f"{table}: expected the scores of each image, found none; restore it")
         counts[split] = len(table.read_text(encoding="utf-8").splitlines()) - 1
     if (folder / "refit.json").is_file():  # scores at refit poses stand beside the others
         for row in read_facts(folder / "refit.json")["rows"]:

@@ -1,7 +1,9 @@
 """Grids of trainings: checked first, resumed, counted right, and written beside the paper's."""
 
 import csv
+import dataclasses
 import json
+import shutil
 import statistics
 
 import pytest
@@ -9,13 +11,14 @@ from training import TINY
 
 from monopart.geometry.errors import InputError, MonopartError
 from monopart.toolkit import cli
-from monopart.toolkit.ablate import SUMMARY, Plan, ablate, cells_of, state_of
+from monopart.toolkit.ablate import SUMMARY, Plan, ablate, cells_of, state_of, summarise
 from monopart.toolkit.ablate_jobs import locked, running_part, start_process
 from monopart.toolkit.ablate_page import page_text, replaced
 from monopart.toolkit.ablate_table import Spread, collected, rows_of, verdict
 from monopart.toolkit.arguments import parse, resolve
 from monopart.toolkit.config import Config
 from monopart.toolkit.grid import FULL, PAPER, Variant, chosen, explicit, read_grid
+from monopart.toolkit.protocols import SPLITS
 from monopart.toolkit.resume import STATE
 
 pytestmark = pytest.mark.usefixtures("short_strip")
@@ -321,6 +324,19 @@ def test_differences_are_paired_over_the_seeds():
     assert "(**-0.08 ± 0.01**)" in page or "(**-0.09 ± 0.01**)" in page
     assert "different states of the code: c0, c1, c2" in page
     assert "4 of 5 trainings: Mind." in page
+
+
+def test_scores_at_refit_poses_are_read_from_the_run(finished, tmp_path):
+    cell = cells_of(finished)[0][0]
+    moved = dataclasses.replace(cell, folder=shutil.copytree(cell.folder, tmp_path / "run"))
+    row = {"split": "novel_pose", "column": "refit (training camera)", "refit": {"full": {}}}
+    (moved.folder / "refit.json").write_text(json.dumps({"rows": [row]}))
+    summary = summarise(moved, finished)
+    assert summary["metrics"]["novel_pose@refit (training camera)"] == {"strict": {"full": {}}}
+    assert summary["images"] == dict.fromkeys(SPLITS, 1)
+    (moved.folder / "images_novel_pose.csv").unlink()
+    with pytest.raises(InputError, match=r"images_novel_pose.csv: expected .* found none"):
+        summarise(moved, finished)
 
 
 def test_refit_poses_are_rows_of_their_own():
