@@ -12,6 +12,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from monopart.geometry.errors import InputError
 
+from .ablate_arguments import Ablate, ProtocolName
 from .config import Config
 from .overrides import overridden
 from .presets import preset, preset_names
@@ -25,7 +26,7 @@ stdout, progress to stderr. Bad input: one line and exit code 2; interrupt: 130.
 What takes long to prepare is kept in ~/.cache/monopart/frames (XDG_CACHE_HOME is heeded), at most
 in 4 GB. MONOPART_CACHE names another folder, or "off"; MONOPART_CACHE_GB another limit; monopart
 info tells where it is and how large."""
-SPLITS = ("novel_view", "novel_pose")
+SPLITS = ("novel_view", "novel_pose", "novel_pose_training_camera")
 OF_PRESET = "(default: the preset's)"
 
 Device = Annotated[str, arg(metavar="cpu|cuda|cuda:N|auto")]
@@ -42,6 +43,7 @@ Settings = Annotated[
     tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="SECTION.ENTRY=VALUE ...")
 ]
 KindsOfSkipping = Annotated[tuple[str, ...], arg(metavar="|".join(KINDS) + " ...")]
+Protocols = Annotated[tuple[ProtocolName, ...], arg(metavar="strict|legacy|boxed ...")]
 PresetName = Annotated[
     str,
     arg(metavar="NAME", help="Configuration to start from: " + ", ".join(preset_names()) + "."),
@@ -76,6 +78,8 @@ class Train:
     """Entries of the configuration to replace, such as train.rays=512; config.json lists them."""
     images: MaybeImages = None
     """Held-out images to evaluate per split, evenly spread."""
+    protocols: Protocols = ("strict",)
+    """Protocols to score under; each costs another pass of LPIPS. strict is always one of them."""
     explain: bool = False
     """Print tables of the rays, samples, part evaluations and modules that were skipped, and of the
     time that this saves."""
@@ -97,14 +101,20 @@ class Train:
             self.out,
             config,
             params=self.params,
-            extras=commands.Extras(self.images, self.explain, self.profile, self.device),
+            extras=commands.Extras(
+                self.images, self.explain, self.profile, self.device, self.protocols
+            ),
             resume=self.resume,
         )
 
 
 @dataclass(frozen=True)
 class Eval:
-    """Score a run on the held-out images of its capture (protocol strict: masked image, black).
+    """Score a run on the held-out images of its capture.
+
+    Protocols: strict (masked image over black; full image, box of the mask, silhouette), legacy
+    (as the published tables: SSIM of data range 2, LPIPS fed [0, 1]) and boxed (legacy inside the
+    box of the body, as NeuralBody).
 
     A run that refined body poses is scored at the poses as given, and in columns of their own at
     refit ones (refit.json). Scores of all images of a split go into metrics.json; a full
@@ -114,11 +124,14 @@ class Eval:
     run_folder: RunArg
     """Folder that monopart train made."""
     split: Annotated[
-        str | None, arg(metavar="novel_view|novel_pose", help_behavior_hint="(default: both)")
+        str | None, arg(metavar="|".join(SPLITS), help_behavior_hint="(default: all)")
     ] = None
-    """Held-out cameras (novel_view) or held-out poses (novel_pose)."""
+    """Held-out cameras at training poses (novel_view), at new poses (novel_pose), or the training
+    camera at new poses."""
     images: MaybeImages = None
     """Images to score per split, evenly spread; the run folder is then left as it is."""
+    protocols: Protocols = ("strict",)
+    """Protocols to score under; each costs another pass of LPIPS. strict is always one of them."""
     capture: MovedCapture = None
     """Folder of the capture, if it has moved."""
     device: Device = "cpu"
@@ -136,7 +149,13 @@ class Eval:
         from . import commands
 
         commands.evaluate(
-            self.run_folder, self.split, self.capture, self.images, self.device, self.truth
+            self.run_folder,
+            self.split,
+            self.capture,
+            self.images,
+            self.device,
+            self.protocols,
+            self.truth,
         )
 
 
@@ -283,7 +302,7 @@ class Demo:
         commands.demo(self.capture, self.out, config, self.device)
 
 
-Command = Train | Eval | Render | Turntable | Info | Demo | Replay
+Command = Train | Eval | Render | Turntable | Info | Demo | Replay | Ablate
 _Commands = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
@@ -292,6 +311,7 @@ _Commands = (
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
+    | Annotated[Ablate, tyro.conf.subcommand("ablate")]
 )
 
 

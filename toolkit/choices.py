@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from .metrics import Protocol
 from .skipping import EVERY, Skipping
 
 
@@ -14,12 +15,14 @@ class Extras:
         explain: print the table of what was skipped, and the time that each kind saves.
         profile: measure the stages of a step first; writes profile.json and profile.html.
         device: see :func:`pick_device`.
+        protocols: names of protocols to score under; ``strict`` is always one.
     """
 
     images: int | None = None
     explain: bool = False
     profile: bool = False
     device: str = "cpu"
+    protocols: tuple[Protocol, ...] = ("strict",)
 
 
 @dataclass(frozen=True)

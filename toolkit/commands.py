@@ -4,7 +4,7 @@ import dataclasses
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +24,7 @@ from .choices import Choices, Extras
 from .config import Config
 from .device import pick_device
 from .explain import print_skipping, why_empty
+from .metrics import Protocol
 from .profile_page import print_profile, write_profile
 from .profiling import profile_training
 from .progress import counted, progress_bar
@@ -104,7 +105,8 @@ def train(
     if extras.explain:
         print_savings("What skipping saves in a training step", training_savings(trainer))
     with stages.timed("evaluation"):
-        evaluations = evaluate_splits(avatar, held_out(avatar.record), extras.images)
+        names = held_out(avatar.record)
+        evaluations = evaluate_splits(avatar, names, extras.images, extras.protocols)
     size = min(STRIP_SIZE, *avatar.record.image_size)
     with stages.timed("turntable strip"):
         strip = [as_uint8(p.color) for p in turn(avatar, STRIP_VIEWS, size=size)]
@@ -236,6 +238,7 @@ def evaluate(
     capture: Path | None,
     images: int | None,
     device: str = "cpu",
+    protocols: Sequence[Protocol] = ("strict",),
     truth: str | None = None,
 ) -> None:
     """Score a run; all images of all splits also rebuild its report.
@@ -246,6 +249,7 @@ def evaluate(
         capture: the capture, if it has moved.
         images: images per split; the run folder is then left as it is. None for all.
         device: see :func:`pick_device`.
+        protocols: names of protocols; ``strict`` is always one.
         truth: name of a folder of exact body poses: the joint error against it is printed.
     """
     avatar, stages = open_run(run, capture, pick_device(device)), Stages()
@@ -254,7 +258,7 @@ def evaluate(
     training = _training_facts(path) if whole else None
     names = held_out(avatar.record) if split is None else [split]
     with stages.timed("evaluation"):
-        evaluations = evaluate_splits(avatar, names, images)
+        evaluations = evaluate_splits(avatar, names, images, protocols)
     report_refit(run, avatar, evaluations, images is None and split is None)
     if truth is not None:
         given, learned = joint_error(avatar, read_capture(avatar.record.root, params=truth))

@@ -1,8 +1,10 @@
-"""Image metrics and the two protocols under which they are reported (PSNR, SSIM, LPIPS-VGG).
+"""Image metrics and the protocols under which they are reported (PSNR, SSIM, LPIPS-VGG).
 
 `strict`: target = image × hard mask over black; data range 1; LPIPS fed [-1, 1]; three regions.
 `legacy`: what the published tables of this line of work show: the full image only, SSIM with
 data range 2 and a uniform 7×7 window, LPIPS fed [0, 1].
+`boxed`: its older habit, since NeuralBody: `legacy`, but PSNR over the pixels whose ray meets the
+box around the posed body, SSIM and LPIPS over the rectangle around these pixels.
 
 Reference: Wang et al., Image Quality Assessment: From Error Visibility to Structural Similarity
 (IEEE TIP 2004), equation 13.
@@ -20,12 +22,15 @@ from monopart.geometry.errors import InputError
 
 from .lpips import LPIPS, MIN_SIZE, ValueRange, average_maps, upsample_maps
 
-Protocol = Literal["strict", "legacy"]
+Protocol = Literal["strict", "legacy", "boxed"]
 Window = Literal["gaussian", "uniform"]
 Scores = dict[str, dict[str, float | None]]
 """Region → metric → value; None where a metric is not defined (no weights, region too small)."""
 
 REGIONS = ("full", "box", "silhouette")
+PROTOCOLS: tuple[Protocol, ...] = ("strict", "legacy", "boxed")
+SHAPE = "shape"
+"""Where scores of silhouette and depth stand among the protocols."""
 METRICS = ("psnr", "ssim", "lpips")
 
 _SIGMA = 1.5
@@ -135,6 +140,7 @@ def score_image(
     mask: Bool[Tensor, "h w"],
     protocol: Protocol = "strict",
     lpips: LPIPS | None = None,
+    box: Bool[Tensor, "h w"] | None = None,
 ) -> Scores:
     """Score one rendered image against its ground truth.
 
@@ -144,18 +150,20 @@ def score_image(
         mask: The true silhouette.
         protocol: `strict`: regions full, box (both images cropped to the mask's bounding box, no
             margin) and silhouette (inside the mask: PSNR of its pixels, means of the SSIM and
-            LPIPS maps over it). `legacy`: region full.
+            LPIPS maps over it). `legacy`: region full. `boxed`: region box.
         lpips: From `load_lpips`; None leaves LPIPS undefined.
+        box: For `boxed`: pixels whose ray meets the box of the body, from `body_box_mask`.
 
     Returns:
         Region → metric → value; None for a metric that is not defined there: LPIPS without
         weights or below 16 pixels, SSIM below its window.
 
     Raises:
-        InputError: an empty mask, a value that is not finite, an unknown protocol.
+        InputError: an empty mask, a value that is not finite, an unknown protocol, no box.
     """
-    if protocol not in ("strict", "legacy"):
-        raise InputError(f"protocol: expected strict or legacy, found {protocol!r}")
+    if protocol not in PROTOCOLS:
+        known = ", ".join(PROTOCOLS)
+        raise InputError(f"protocol: expected one of {known}, found {protocol!r}; choose one")
     if not bool(mask.any()):
         raise InputError("mask: expected a silhouette, found no pixel; leave this frame out")
     if not bool(pred.isfinite().all()):
@@ -163,11 +171,13 @@ def score_image(
     target = target * mask[..., None]
     if protocol == "legacy":
         return {"full": _score_whole(pred, target, "legacy", lpips)}
+    if protocol == "boxed":
+        return {"box": _score_boxed(pred, target, box, lpips)}
     scores, inside = _score_full_and_silhouette(pred, target, mask, lpips)
     top, left, bottom, right = mask_box(mask)
     crop = (slice(top, bottom), slice(left, right))
-    box = _score_whole(pred[crop], target[crop], "strict", lpips)
-    return {"full": scores, "box": box, "silhouette": inside}
+    cropped = _score_whole(pred[crop], target[crop], "strict", lpips)
+    return {"full": scores, "box": cropped, "silhouette": inside}
 
 
 def mask_box(mask: Bool[Tensor, "h w"]) -> tuple[int, int, int, int]:
@@ -235,6 +245,22 @@ def _score_whole(
         maps = lpips.layer_maps(pred, target, value_range=value_range, skip_black=True)
         distance = average_maps(maps).item()
     return {"psnr": psnr(pred, target), "ssim": similarity, "lpips": distance}
+
+
+def _score_boxed(
+    pred: Tensor, target: Tensor, box: Tensor | None, lpips: LPIPS | None
+) -> dict[str, float | None]:
+    """PSNR over the box of the body, the other metrics over the rectangle around it."""
+    if box is None or not bool(box.any()):
+        found = "none" if box is None else "no pixel"
+        raise InputError(
+            f"box: expected the pixels of the body's box, found {found}; take body_box_mask of a "
+            "camera that sees the body"
+        )
+    top, left, bottom, right = mask_box(box)
+    crop = (slice(top, bottom), slice(left, right))
+    scores = _score_whole(pred[crop], target[crop], "legacy", lpips)
+    return scores | {"psnr": psnr(pred, target, box)}
 
 
 def _score_full_and_silhouette(

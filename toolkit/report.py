@@ -40,6 +40,7 @@ from .report_sections import (
 )
 from .report_style import SCRIPT, STYLE
 from .report_training import capacity_section, round_trips_section
+from .report_worst import shape_section, worst_section
 from .video import Image
 
 __all__ = [
@@ -55,7 +56,9 @@ __all__ = [
 
 _SECTIONS = {
     "images": "Images",
+    "worst": "Worst",
     "metrics": "Metrics",
+    "shape": "Shape",
     "training": "Training",
     "cost": "Cost",
     "skipped": "Skipped",
@@ -267,14 +270,15 @@ def report_html(data: ReportData) -> str:
     >>> report_html(ReportData("A run")).startswith("<!doctype html>")
     True
     """
-    links = "".join(f'<a href="#{k}">{v}</a>' for k, v in _SECTIONS.items())
     capture = facts(data.capture) if data.capture else missing("No facts on the capture.")
     settings = details("Configuration", data.config, "No configuration was given.") + details(
         "Environment", data.environment, "No facts on the environment."
     )
     sections = (
         _images_section(data)
+        + worst_section(data.worst)
         + metrics_section(data)
+        + shape_section(data.metrics)
         + curves_section(data.curves)
         + round_trips_section(data.curves, data.round_trips)
         + capacity_section(data.capacity)
@@ -283,6 +287,8 @@ def report_html(data: ReportData) -> str:
         + section("capture", "Capture", "", capture)
         + section("settings", "Settings", "", settings)
     )
+    shown_sections = {k: v for k, v in _SECTIONS.items() if f'<section id="{k}"' in sections}
+    links = "".join(f'<a href="#{k}">{v}</a>' for k, v in shown_sections.items())
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'

@@ -14,6 +14,7 @@ from .avatar import Avatar
 from .captures import describe
 from .evaluate import Evaluation, ImageScore
 from .report_data import Headline, ReferenceRow, ReportData, SkipRow, Timings, Triple
+from .report_worst import worst_frames
 from .runs import read_facts
 from .train_result import TrainResult
 from .video import Image
@@ -74,6 +75,7 @@ def report_data(run: Path, avatar: Avatar, results: RunResults) -> ReportData:
         triples=[
             t for e in results.evaluations for t in triples(avatar, e, len(results.evaluations))
         ],
+        worst=[w for e in results.evaluations for w in worst_frames(record, e)],
         turntable=results.strip,
         timings=timings,
         skipping=results.skipping,
@@ -168,7 +170,7 @@ def merged_metrics(path: Path, evaluations: Sequence[Evaluation]) -> dict[str, A
     """The content of a metrics.json with the means of evaluations put in."""
     metrics: dict[str, Any] = read_facts(path) if path.is_file() else {}
     for evaluation in evaluations:
-        metrics.setdefault(evaluation.split, {})[evaluation.protocol] = evaluation.mean
+        metrics.setdefault(evaluation.split, {}).update(evaluation.means)
     return metrics
 
 

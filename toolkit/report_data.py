@@ -42,6 +42,20 @@ class Triple:
 
 
 @dataclass(frozen=True)
+class WorstFrame:
+    """One of the worst images of a split."""
+
+    label: str
+    """Such as "camera B2, frame 30"."""
+    split: str
+    """Such as "novel_view"."""
+    image: Image
+    """Rendered, truth and difference in a row, uint8."""
+    scores: Mapping[str, Number | None] = field(default_factory=dict)
+    """psnr, ssim, lpips of this image; None: not computed."""
+
+
+@dataclass(frozen=True)
 class Timings:
     """What the run cost."""
 
@@ -117,6 +131,8 @@ class ReportData:
     """metrics.json: {split: {protocol: {region: {"psnr", "ssim", "lpips"}}}}."""
     triples: Sequence[Triple] = ()
     """Held-out images."""
+    worst: Sequence[WorstFrame] = ()
+    """The worst images of each split, the worst first."""
     turntable: Sequence[Image] = ()
     """Frames of one turn, of one size; 6 to 12 look best."""
     timings: Timings = field(default_factory=Timings)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from .charts import Series, line_chart
+from .metrics import SHAPE
 from .report_data import Number, ReportData, SkipRow, Timings
 
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4}
@@ -117,6 +118,8 @@ def metrics_section(data: ReportData) -> str:
     rows, null = [], False
     for split, protocols in data.metrics.items():
         for protocol, regions in protocols.items():
+            if protocol == SHAPE:  # has a table of its own
+                continue
             for region, scores in regions.items():
                 null = null or any(scores.get(n) is None for n in _DIGITS)
                 cells = "".join(_score_cell(n, scores.get(n)) for n in _DIGITS)

@@ -57,6 +57,9 @@ padding:14px 16px}
 .three figcaption{font-size:12px;color:var(--muted);margin-top:4px}
 .three img,.three .missing{width:100%;display:block;border-radius:3px}
 .three img{height:auto}
+.worst{display:grid;grid-template-columns:repeat(auto-fill,minmax(300px,1fr));gap:12px}
+.worst figure{margin:0}
+.worst figcaption{font-size:12px;color:var(--muted);margin-top:4px}
 .three .missing{aspect-ratio:.6;overflow:auto;font-size:13px;padding:10px}
 .three.zooms img{cursor:zoom-in}
 .three img:focus-visible,a:focus-visible,summary:focus-visible,button:focus-visible{

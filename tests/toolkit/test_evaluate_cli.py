@@ -13,6 +13,7 @@ from monopart.toolkit.avatar import view_of
 from monopart.toolkit.captures import describe, read_capture
 from monopart.toolkit.evaluate import evaluate_split, images_csv
 from monopart.toolkit.lpips import load_lpips
+from monopart.toolkit.protocols import SPLITS
 from monopart.toolkit.report_content import capture_facts
 from monopart.toolkit.runs import open_run
 
@@ -41,7 +42,8 @@ def test_a_full_evaluation_repeats_that_of_training(run, trained_run, capsys):
     assert cli.main(["eval", str(run)]) is None
     assert (run / "metrics.json").read_bytes() == (trained_run / "metrics.json").read_bytes()
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in lines] == ["novel_view", "novel_pose", "report"]
+    names = [f"{split}, {kind}" for split in SPLITS for kind in ("strict", "shape")]
+    assert [line.split(":")[0] for line in lines] == [*names, "report"]
     page = (run / "report.html").read_text(encoding="utf-8")
     assert "worst of split" in page and "training: colour networks" in page
     facts, before = (json.loads((r / "training.json").read_text()) for r in (run, trained_run))
@@ -51,12 +53,13 @@ def test_a_full_evaluation_repeats_that_of_training(run, trained_run, capsys):
 
 def test_one_split_is_merged(run, trained_run, capsys):
     metrics = json.loads((run / "metrics.json").read_text())
-    (run / "metrics.json").write_text(json.dumps({"novel_pose": metrics["novel_pose"]}))
+    others = {name: metrics[name] for name in SPLITS[1:]}
+    (run / "metrics.json").write_text(json.dumps(others))
     report = (run / "report.html").read_bytes()
     assert cli.main(["eval", str(run), "--split", "novel_view"]) is None
     assert json.loads((run / "metrics.json").read_text()) == metrics
     assert (run / "report.html").read_bytes() == report
-    assert capsys.readouterr().out.startswith("novel_view: full ")
+    assert capsys.readouterr().out.startswith("novel_view, strict: full ")
 
 
 def test_some_images_leave_the_run_as_it_is(run, capsys):
@@ -77,10 +80,13 @@ def test_csv_holds_every_image(trained_run):
     avatar = open_run(trained_run)
     evaluation = evaluate_split(avatar, "novel_pose", None)
     rows = list(csv.DictReader(io.StringIO(images_csv(evaluation, avatar.record.camera_names))))
-    assert [(r["camera"], r["frame"]) for r in rows] == [("Camera_B1", "3"), ("Camera_B2", "3")]
+    assert [(r["camera"], r["frame"]) for r in rows] == [("Camera_B2", "3")]
     for row, image in zip(rows, evaluation.images, strict=True):
-        assert float(row["full_psnr"]) == pytest.approx(image.scores["full"]["psnr"], rel=1e-5)
-        assert row["full_lpips"] == "" and float(row["seconds"]) >= 0
+        assert float(row["strict_full_psnr"]) == pytest.approx(
+            image.scores["full"]["psnr"], rel=1e-5
+        )
+        assert float(row["shape_full_mask_iou"]) == pytest.approx(image.shape["mask_iou"], rel=1e-5)
+        assert row["strict_full_lpips"] == "" and float(row["seconds"]) >= 0
     assert evaluation.mean["box"]["lpips"] is None
 
 

@@ -82,6 +82,18 @@ def test_matches_golden_numbers(trained, name, value_range):
     assert trained(a, b, value_range=value_range).item() == pytest.approx(expected, rel=2e-5)
 
 
+def test_equals_the_lpips_package(trained):
+    """Figures of the package itself with the heads that it ships: `golden_lpips_package.py`."""
+    figures = json.loads(Path(__file__).with_name("golden_lpips_package.json").read_text())
+    heads = [trained.get_buffer(f"head_{i}_weight").sum().item() for i in range(5)]
+    assert heads == pytest.approx(figures.pop("heads"), rel=1e-6)
+    for name, expected in figures.items():
+        a, b = (torch.tensor(image, dtype=torch.float32) for image in golden.images()[name])
+        for value_range in RANGES:
+            found = trained(a, b, value_range=value_range).item()
+            assert found == pytest.approx(expected[value_range], rel=2e-5)
+
+
 def test_trained_weights_are_those_of_vgg16(trained):
     # First rows of torchvision's VGG16 `features.0.weight` and its biases.
     first = trained.conv_0_weight[0, 0, :2]

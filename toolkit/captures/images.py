@@ -4,7 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, UInt8, UInt16
 
 from monopart.geometry.errors import InputError
 
@@ -50,6 +50,27 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
             return np.asarray(colors.any(axis=2))
         mask = colors[..., 0]
     return np.asarray(mask > 127 if mask.max(initial=0) > 127 else mask != 0)
+
+
+def read_depth(path: Path) -> UInt16[np.ndarray, "h w"]:
+    """Reads a depth map.
+
+    Args:
+        path: PNG of one channel with 16 bits.
+
+    Returns:
+        Millimetres along the optical axis, height width; 0 where nothing is.
+
+    Raises:
+        InputError: no such file, or one that is not a complete 16 bit image of one channel.
+    """
+    depth = _decode(path, cv2.IMREAD_UNCHANGED)
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        raise InputError(
+            f"{path}: expected 16 bit depths of one channel, found {depth.dtype} "
+            f"{tuple(depth.shape)}; save millimetres as a 16 bit PNG"
+        )
+    return depth
 
 
 def read_vertices(path: Path) -> Float[np.ndarray, "v 3"]:
