@@ -15,12 +15,13 @@ from monopart.geometry.errors import InputError
 from .config import Config
 from .overrides import overridden
 from .presets import preset, preset_names
+from .reading_arguments import AS_IT_IS, Flags
 from .skipping import EVERY, KINDS
 
 PROGRAM = """Animatable avatars from monocular video.
 
-CAPTURE is a folder in the layout of ZJU-MoCap; RUN is a folder that training makes. Results go to
-stdout, progress to stderr. Bad input: one line and exit code 2; interrupt: 130.
+CAPTURE is a folder in the layout of ZJU-MoCap or MonoCap; RUN is a folder that training makes.
+Results go to stdout, progress to stderr. Bad input: one line and exit code 2; interrupt: 130.
 
 What takes long to prepare is kept in ~/.cache/monopart/frames (XDG_CACHE_HOME is heeded), at most
 in 4 GB. MONOPART_CACHE names another folder, or "off"; MONOPART_CACHE_GB another limit; monopart
@@ -68,10 +69,8 @@ class Train:
     """Steps of training; not together with --seconds."""
     seed: Annotated[int | None, arg(metavar="K", help_behavior_hint=OF_PRESET)] = None
     """Seed of initial values, batches and jitter, from 0."""
-    params: Annotated[
-        str | None, arg(metavar="NAME", help_behavior_hint="(default: new_params, else params)")
-    ] = None
-    """Folder of body poses inside the capture."""
+    reading: Flags = AS_IT_IS
+    """How the capture is read."""
     set: Settings = ()
     """Entries of the configuration to replace, such as train.rays=512; config.json lists them."""
     images: MaybeImages = None
@@ -96,7 +95,7 @@ class Train:
             self.capture,
             self.out,
             config,
-            params=self.params,
+            reading=self.reading.reading(),
             extras=commands.Extras(self.images, self.explain, self.profile, self.device),
             resume=self.resume,
         )
@@ -226,12 +225,14 @@ class Info:
 
     path: Annotated[Positional[Path], arg(metavar="CAPTURE|RUN")]
     """Folder of a capture or of a run."""
+    reading: Flags = AS_IT_IS
+    """How a capture is read."""
 
     def run(self) -> None:
         """Do it."""
         from . import commands
 
-        commands.info(self.path)
+        commands.info(self.path, self.reading.reading())
 
 
 @dataclass(frozen=True)
