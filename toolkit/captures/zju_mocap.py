@@ -1,5 +1,6 @@
 """Reader of the ZJU-MoCap folder layout: `annots.npy`, images, masks, body parameters."""
 
+import os
 from pathlib import Path
 
 from monopart.geometry.errors import InputError
@@ -112,25 +113,42 @@ def _frames(
             f"parameters, named by frame number"
         )
     used = {pair: name for name, split in splits.items() for pair in split.pairs()}
-    frames = {}
+    frames, masks = {}, _Masks(folders)
     for pair, name in pictures.items():
-        frames[pair] = Frame(pair[1], pair[0], root / name, _mask_path(folders, name))
+        frames[pair] = Frame(pair[1], pair[0], root / name, masks.path(Path(name)))
         if pair in used:
             _check_exists(frames[pair], used[pair])
     return frames
 
 
-def _beside(name: str) -> list[Path]:
-    """Where in its folder the mask of an image may lie: with or without the leading `images`."""
-    path = Path(name).with_suffix(".png")
-    return [path, Path(*path.parts[1:])] if path.parts[0] == "images" else [path]
+class _Masks:
+    """Finds masks; looks into each folder once."""
+
+    def __init__(self, folders: list[Path]) -> None:
+        self.folders = folders
+        self.places: dict[Path, list[tuple[Path, frozenset[str]]]] = {}
+
+    def path(self, image: Path) -> Path:
+        """The first mask of an image that exists; where there is none, one that could.
+
+        Args:
+            image: relative path of the image.
+        """
+        name, places = f"{image.stem}.png", self._places(image.parent)
+        found = next((place / name for place, names in places if name in names), None)
+        return self.folders[0] / _beside(image.parent)[-1] / name if found is None else found
+
+    def _places(self, parent: Path) -> list[tuple[Path, frozenset[str]]]:
+        if parent not in self.places:
+            folders = [f / place for f in self.folders for place in _beside(parent)]
+            listed = [(f, frozenset(os.listdir(f) if f.is_dir() else ())) for f in folders]
+            self.places[parent] = listed
+        return self.places[parent]
 
 
-def _mask_path(folders: list[Path], name: str) -> Path:
-    """The first mask of an image that exists; where there is none, one that could."""
-    candidates = (folder / place for folder in folders for place in _beside(name))
-    found = next((path for path in candidates if path.is_file()), None)
-    return folders[0] / _beside(name)[-1] if found is None else found
+def _beside(parent: Path) -> list[Path]:
+    """Folders of a mask, seen from that of its image: with and without a leading `images`."""
+    return [parent, Path(*parent.parts[1:])] if parent.parts[:1] == ("images",) else [parent]
 
 
 def _check_exists(frame: Frame, split: str) -> None:
