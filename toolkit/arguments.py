@@ -16,6 +16,7 @@ from .config import Config
 from .overrides import overridden
 from .presets import preset, preset_names
 from .reading_arguments import AS_IT_IS, Flags
+from .reproduce_arguments import Reproduce
 from .skipping import EVERY, KINDS
 
 PROGRAM = """Animatable avatars from monocular video.
@@ -26,7 +27,7 @@ Results go to stdout, progress to stderr. Bad input: one line and exit code 2; i
 What takes long to prepare is kept in ~/.cache/monopart/frames (XDG_CACHE_HOME is heeded), at most
 in 4 GB. MONOPART_CACHE names another folder, or "off"; MONOPART_CACHE_GB another limit; monopart
 info tells where it is and how large."""
-SPLITS = ("novel_view", "novel_pose")
+SPLITS = ("novel_view", "novel_pose", "novel_pose_training_camera")
 OF_PRESET = "(default: the preset's)"
 
 Device = Annotated[str, arg(metavar="cpu|cuda|cuda:N|auto")]
@@ -111,9 +112,9 @@ class Eval:
     run_folder: RunArg
     """Folder that monopart train made."""
     split: Annotated[
-        str | None, arg(metavar="novel_view|novel_pose", help_behavior_hint="(default: both)")
+        str | None, arg(metavar="|".join(SPLITS), help_behavior_hint="(default: all)")
     ] = None
-    """Held-out cameras (novel_view) or held-out poses (novel_pose)."""
+    """Held-out cameras, or held-out poses on held-out cameras or on the training camera."""
     images: MaybeImages = None
     """Images to score per split, evenly spread; the run folder is then left as it is."""
     capture: MovedCapture = None
@@ -264,7 +265,7 @@ class Demo:
         commands.demo(self.capture, self.out, config, self.device)
 
 
-Command = Train | Eval | Render | Turntable | Info | Demo
+Command = Train | Eval | Render | Turntable | Info | Demo | Reproduce
 _Commands = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
@@ -272,6 +273,7 @@ _Commands = (
     | Annotated[Turntable, tyro.conf.subcommand("turntable")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
 )
 
 

@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from .avatar import Avatar, view_of
+from .captures.subjects import ON_TRAINING_CAMERA
 from .lpips import LPIPS
 from .metrics import Scores, aggregate, score_image
 from .render import render_view
 
-SPLITS = ("novel_view", "novel_pose")
+SPLITS = ("novel_view", "novel_pose", ON_TRAINING_CAMERA)
 
 
 @dataclass(frozen=True)

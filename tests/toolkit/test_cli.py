@@ -20,7 +20,7 @@ from monopart.toolkit.train import Trainer
 
 pytestmark = pytest.mark.usefixtures("short_strip")
 SNAPSHOT = Path(__file__).parents[1] / "snapshots" / "cli_help.txt"
-COMMANDS = ("train", "eval", "render", "turntable", "info", "demo")
+COMMANDS = ("train", "eval", "render", "turntable", "info", "demo", "reproduce")
 FILES = {
     "config.json",
     "capture.json",
@@ -193,7 +193,10 @@ def test_a_pickle_that_runs_code(tmp_path, capsys):
         (["train", "c", "--out", "r", "--seed", "-1"], "--seed: expected 0"),
         (["train", "c", "--out", "r", "--set", "train.rays=x"], "train.rays: expected whole numbe"),
         (["eval", "nowhere"], "nowhere: expected a run folder"),
-        (["eval", "r", "--split", "train"], "--split: expected novel_view or novel_pose"),
+        (
+            ["eval", "r", "--split", "train"],
+            "--split: expected novel_view or novel_pose or",
+        ),
         (["render", "r", "--camera", "a", "--frame", "0", "--out", "a.jpg"], "ends in .png"),
         (["render", "r", "--camera", "a", "--frame", "0", "--out", "no/a.png"], "existing folder"),
         (["turntable", "r", "--out", "a.gif"], "ends in .mp4"),
