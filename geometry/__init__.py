@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from .boxes import box_of as box_of
     from .boxes import in_box as in_box
     from .boxes import ray_box as ray_box
+    from .camera_paths import orbit_cameras as orbit_cameras
     from .cameras import Camera as Camera
     from .cameras import Rays as Rays
-    from .cameras import orbit_cameras as orbit_cameras
     from .consistency import consistency_loss as consistency_loss
     from .consistency import round_trip as round_trip
     from .culling import BodyShell as BodyShell
@@ -98,7 +98,7 @@ _ROOM = {
     "inverse_skin": "unskin",
     "inverse_skin_all": "unskin_roots",
     "invert_affine": "rigid",
-    "orbit_cameras": "cameras",
+    "orbit_cameras": "camera_paths",
     "quat_wxyz_to_rotmat": "rotations",
     "ray_box": "boxes",
     "read_body_arrays": "body_io",

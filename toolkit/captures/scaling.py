@@ -60,7 +60,7 @@ def camera_at(raw: Camera, scale: float, legacy_pixels: bool = False) -> Camera:
     Raises:
         InputError: a factor that is not above 0 and at most 1.
     """
-    ideal = replace(raw, distortion=raw.K.new_zeros(0)) if raw.is_distorted else raw
+    ideal = raw.without_lens()
     size = scaled_size(raw.size, scale, legacy_pixels)
     if scale == 1:
         return ideal
