@@ -6,6 +6,8 @@ from pathlib import Path
 from monopart.geometry.errors import InputError
 
 from .checks import CaptureCheck, check_capture, describe
+from .colmap import read_colmap, write_colmap
+from .easymocap import read_easymocap, write_easymocap
 from .frames import Frame, Split
 from .reading import Reading
 from .records import CaptureRecord, Progress
@@ -24,8 +26,12 @@ __all__ = [
     "check_capture",
     "describe",
     "read_capture",
+    "read_colmap",
+    "read_easymocap",
     "read_zju_mocap",
     "subject",
+    "write_colmap",
+    "write_easymocap",
 ]
 
 
