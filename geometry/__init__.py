@@ -23,9 +23,19 @@ if TYPE_CHECKING:
     from .boxes import box_of as box_of
     from .boxes import in_box as in_box
     from .boxes import ray_box as ray_box
+    from .camera_conventions import BlenderCamera as BlenderCamera
+    from .camera_conventions import PyTorch3DCamera as PyTorch3DCamera
+    from .camera_conventions import camera_from_blender as camera_from_blender
+    from .camera_conventions import camera_from_opengl as camera_from_opengl
+    from .camera_conventions import camera_from_pytorch3d as camera_from_pytorch3d
+    from .camera_conventions import camera_to_blender as camera_to_blender
+    from .camera_conventions import camera_to_opengl as camera_to_opengl
+    from .camera_conventions import camera_to_pytorch3d as camera_to_pytorch3d
+    from .camera_paths import blend_cameras as blend_cameras
+    from .camera_paths import orbit_cameras as orbit_cameras
+    from .camera_paths import ring_of_cameras as ring_of_cameras
     from .cameras import Camera as Camera
     from .cameras import Rays as Rays
-    from .cameras import orbit_cameras as orbit_cameras
     from .consistency import consistency_loss as consistency_loss
     from .consistency import round_trip as round_trip
     from .culling import BodyShell as BodyShell
@@ -65,6 +75,7 @@ if TYPE_CHECKING:
 
 _ROOM = {
     "BackendError": "errors",
+    "BlenderCamera": "camera_conventions",
     "BodyModel": "body",
     "BodyPose": "body",
     "BodyShell": "culling",
@@ -78,6 +89,7 @@ _ROOM = {
     "PartPairs": "posed_parts",
     "PosedBody": "body",
     "PosedParts": "posed_parts",
+    "PyTorch3DCamera": "camera_conventions",
     "Rays": "cameras",
     "RestPoints": "posed_parts",
     "ShellSamples": "culling",
@@ -88,10 +100,17 @@ _ROOM = {
     "Unskinned": "unskin",
     "UnskinnedRoots": "unskin_roots",
     "axis_angle_to_rotmat": "rotations",
+    "blend_cameras": "camera_paths",
     "blend_skin": "skinning",
     "blend_transforms": "skinning",
     "box_mask": "boxes",
     "box_of": "boxes",
+    "camera_from_blender": "camera_conventions",
+    "camera_from_opengl": "camera_conventions",
+    "camera_from_pytorch3d": "camera_conventions",
+    "camera_to_blender": "camera_conventions",
+    "camera_to_opengl": "camera_conventions",
+    "camera_to_pytorch3d": "camera_conventions",
     "closest_point": "surface",
     "consistency_loss": "consistency",
     "convert_smplx_translation": "body",
@@ -100,11 +119,12 @@ _ROOM = {
     "inverse_skin": "unskin",
     "inverse_skin_all": "unskin_roots",
     "invert_affine": "rigid",
-    "orbit_cameras": "cameras",
+    "orbit_cameras": "camera_paths",
     "quat_wxyz_to_rotmat": "rotations",
     "ray_box": "boxes",
     "read_body_arrays": "body_io",
     "read_npy_object": "body_io",
+    "ring_of_cameras": "camera_paths",
     "rotation_angle": "rotations",
     "rotmat_to_axis_angle": "rotations",
     "rotmat_to_quat_wxyz": "rotations",

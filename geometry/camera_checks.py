@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .distortion import COEFFICIENT_COUNTS
 from .errors import InputError
+from .lenses import check_lens
 
 
 def check_size(size: tuple[int, int]) -> None:
@@ -47,8 +47,40 @@ def intrinsics_from_fov(ref: Tensor, size: tuple[int, int], fov: float) -> Float
     return ref.new_tensor([[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1]])
 
 
+def look_at_rotation(
+    eye: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "3 3"]:
+    """Rotation world → camera of a view from one point to another.
+
+    Args:
+        eye: camera centre, world metres, 3.
+        target: point seen along the optical axis, world metres, 3.
+        up: direction that points up in the image, world axes, any length, 3.
+
+    Returns:
+        R, 3 3, differentiable in all three.
+
+    Raises:
+        InputError: a target at the eye, up along the view.
+
+    >>> y, z = torch.tensor([0.0, 1, 0]), torch.tensor([0.0, 0, 1])
+    >>> look_at_rotation(torch.zeros(3), y, z).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+    """
+    forward = target - eye
+    right = torch.linalg.cross(forward, up)
+    if not float(right.norm()) > 1e-6 * float(forward.norm() * up.norm()):
+        raise InputError(
+            f"look_at: expected up not along the view, found up {up.tolist()} and view "
+            f"{forward.tolist()}; move the target or choose another up"
+        )
+    z = forward / forward.norm()
+    x = right / right.norm()
+    return torch.stack([x, torch.linalg.cross(z, x), z])
+
+
 def check_camera(
-    K: Tensor, R: Tensor, t: Tensor, size: tuple[int, int], distortion: Tensor
+    K: Tensor, R: Tensor, t: Tensor, size: tuple[int, int], distortion: Tensor, lens: str = "brown"
 ) -> None:
     """Refuses cameras that cannot project.
 
@@ -58,6 +90,7 @@ def check_camera(
         t: translation, 3.
         size: (height, width) in pixels.
         distortion: coefficients in OpenCV's order, d.
+        lens: kind of lens.
 
     Raises:
         InputError: as `Camera` says.
@@ -75,11 +108,7 @@ def check_camera(
                 f"{value.dtype} on {value.device}; convert it"
             )
     check_size(size)
-    if distortion.numel() not in COEFFICIENT_COUNTS:
-        raise InputError(
-            f"distortion: expected {COEFFICIENT_COUNTS} coefficients in OpenCV's order, found "
-            f"{distortion.numel()}; pad with zeros or drop the tilt terms"
-        )
+    check_lens(lens, distortion.numel())
     _check_rotation(R.detach())
     _check_intrinsics(K.detach().tolist())
 

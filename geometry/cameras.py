@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from .camera_checks import check_camera, check_size, intrinsics_from_fov
-from .distortion import distort_extended, fold_radius, undistort
+from .camera_checks import check_camera, check_size, intrinsics_from_fov, look_at_rotation
 from .errors import InputError
+from .lenses import is_bent, lens_distort, lens_fold_radius, lens_undistort
 
 MIN_DEPTH = 1e-6
 """Metres in front of the camera below which a point counts as behind it."""
@@ -72,10 +72,13 @@ class Camera:
     size: tuple[int, int]
     """(height, width) in pixels."""
     distortion: Shaped[Tensor, "..."] = field(default_factory=lambda: torch.zeros(0))
-    """d: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], or empty."""
+    """d: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [τx τy]]]], or empty; k1 k2 k3 k4 of a
+    fisheye."""
+    lens: str = "brown"
+    """`brown` or `fisheye`: what the coefficients mean."""
 
     def __post_init__(self) -> None:
-        check_camera(self.K, self.R, self.t, self.size, self.distortion)
+        check_camera(self.K, self.R, self.t, self.size, self.distortion, self.lens)
         if self.distortion.numel() == 0:
             object.__setattr__(self, "distortion", self.K.new_zeros(0))
 
@@ -87,6 +90,7 @@ class Camera:
         t: Shaped[Tensor, "..."],
         size: tuple[int, int],
         distortion: Shaped[Tensor, "..."] | None = None,
+        lens: str = "brown",
     ) -> "Camera":
         """Camera from intrinsics that put pixel centres at whole numbers (OpenCV, ZJU-MoCap).
 
@@ -96,6 +100,7 @@ class Camera:
             t: translation world → camera, metres, 3.
             size: (height, width) in pixels.
             distortion: coefficients in OpenCV's order, d; none when left out.
+            lens: kind of lens.
 
         Returns:
             The same camera with ½ added to cx and cy.
@@ -108,7 +113,7 @@ class Camera:
         shift = K.new_zeros(3, 3)
         shift[:2, 2] = 0.5
         coefficients = K.new_zeros(0) if distortion is None else distortion
-        return cls(K + shift, R, t, size, coefficients)
+        return cls(K + shift, R, t, size, coefficients, lens)
 
     @classmethod
     def look_at(
@@ -139,16 +144,7 @@ class Camera:
         """
         if (fov is None) == (K is None):
             raise InputError("look_at: expected exactly one of fov and K; leave the other out")
-        forward = target - eye
-        right = torch.linalg.cross(forward, up)
-        if not float(right.norm()) > 1e-6 * float(forward.norm() * up.norm()):
-            raise InputError(
-                f"look_at: expected up not along the view, found up {up.tolist()} and view "
-                f"{forward.tolist()}; move the target or choose another up"
-            )
-        z = forward / forward.norm()
-        x = right / right.norm()
-        R = torch.stack([x, torch.linalg.cross(z, x), z])
+        R = look_at_rotation(eye, target, up)
         if K is None:
             K = intrinsics_from_fov(eye, size, float(fov or 0.0))
         return cls(K, R, -(R @ eye), size)
@@ -160,13 +156,13 @@ class Camera:
 
     @cached_property
     def is_distorted(self) -> bool:
-        """Whether any distortion coefficient differs from zero."""
-        return bool((self.distortion.detach() != 0).any())
+        """Whether the lens differs from a pinhole: a fisheye, or a coefficient that is not zero."""
+        return is_bent(self.lens, self.distortion)
 
     @cached_property
     def fold_radius(self) -> float:
         """Radius |(x, y)|/z up to which the lens is one-to-one; infinite for a pinhole."""
-        return fold_radius(self.distortion) if self.is_distorted else math.inf
+        return lens_fold_radius(self.lens, self.distortion) if self.is_distorted else math.inf
 
     def to(self, ref: Tensor) -> "Camera":
         """Same camera on the device and in the float dtype of a tensor.
@@ -326,6 +322,16 @@ class Camera:
         shift[0, 2], shift[1, 2] = x0, y0
         return dataclasses.replace(self, K=self.K - shift, size=(y1 - y0, x1 - x0))
 
+    def without_lens(self) -> "Camera":
+        """Pinhole camera with the same K; itself where there is no distortion.
+
+        Returns:
+            The camera.
+        """
+        if not self.is_distorted:
+            return self
+        return dataclasses.replace(self, distortion=self.K.new_zeros(0), lens="brown")
+
     def undistorted(self) -> tuple["Camera", Float[Tensor, "h w 2"]]:
         """Pinhole camera with the same K, and where each of its pixels lies in the distorted image.
 
@@ -337,7 +343,7 @@ class Camera:
         grid = self.pixel_grid()
         if not self.is_distorted:
             return self, grid
-        ideal = dataclasses.replace(self, distortion=self.K.new_zeros(0))
+        ideal = self.without_lens()
         plane, _ = ideal._pixels_to_plane(grid)
         return ideal, self._plane_to_pixels(plane)
 
@@ -345,7 +351,8 @@ class Camera:
         """Lens and intrinsics: ideal points on the plane z = 1 → pixels."""
         K = self.K.to(plane)
         if self.is_distorted:
-            plane = distort_extended(plane, self.distortion.to(plane), self.fold_radius)
+            coefficients = self.distortion.to(plane)
+            plane = lens_distort(self.lens, plane, coefficients, self.fold_radius)
         return plane @ K[:2, :2].mT + K[:2, 2]
 
     def _pixels_to_plane(
@@ -358,41 +365,4 @@ class Camera:
         plane = torch.stack([x, y], -1)
         if not self.is_distorted:
             return plane, torch.ones_like(x, dtype=torch.bool)
-        return undistort(plane, self.distortion.to(pixels), self.fold_radius)
-
-
-def orbit_cameras(
-    camera: Camera, center: Float[Tensor, "3"], up: Float[Tensor, "3"], count: int
-) -> list[Camera]:
-    """Cameras on the circle through a given camera, around a vertical axis: a turntable.
-
-    Args:
-        camera: the first camera of the circle.
-        center: a point of the axis, world metres, 3.
-        up: direction of the axis, world axes, any length, 3; the cameras turn counter-clockwise
-            seen from its tip.
-        count: number of cameras, evenly spaced over the full circle.
-
-    Returns:
-        `count` cameras that see the axis as the given one does; the first one equals it.
-
-    Raises:
-        InputError: a count below one, an axis of zero length.
-    """
-    length = float(up.norm())
-    if count < 1:
-        raise InputError(f"count: expected at least one camera, found {count}; pass count >= 1")
-    if not length > 0:
-        raise InputError(f"up: expected a direction, found {up.tolist()}; pass e.g. (0, 0, 1)")
-    axis, pivot = (up / length).to(camera.K), center.to(camera.K)
-    cross = torch.linalg.cross(axis.expand(3, 3), torch.eye(3).to(axis)).mT
-    cameras = []
-    for i in range(count):
-        angle = 2 * math.pi * i / count
-        turn = torch.eye(3).to(axis) + math.sin(angle) * cross
-        turn = turn + (1 - math.cos(angle)) * (cross @ cross)
-        # x = pivot + turn (x0 - pivot) undone before the first camera's R and t
-        R = camera.R @ turn.mT
-        t = camera.t + camera.R @ pivot - R @ pivot
-        cameras.append(dataclasses.replace(camera, R=R, t=t))
-    return cameras
+        return lens_undistort(self.lens, plane, self.distortion.to(pixels), self.fold_radius)

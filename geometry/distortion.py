@@ -1,4 +1,4 @@
-"""Brown-Conrady lens distortion on the plane z = 1, its Jacobian, its fold and its inverse."""
+"""OpenCV's lens on the plane z = 1 (Brown-Conrady and more): Jacobian, fold and inverse."""
 
 import math
 from functools import lru_cache
@@ -9,9 +9,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .errors import InputError
+from .tilt import map_plane, map_plane_jacobian, tilt_matrix
+from .two_by_two import solve_two_by_two
 
-COEFFICIENT_COUNTS = (0, 4, 5, 8, 12)
-"""Accepted lengths: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], OpenCV's order."""
+COEFFICIENT_COUNTS = (0, 4, 5, 8, 12, 14)
+"""Accepted lengths: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [τx τy]]]], OpenCV's order."""
 
 MAX_RADIUS = 10.0
 """Radius on the plane z = 1 (84 degrees off axis) up to which a lens without a fold is trusted."""
@@ -22,15 +24,20 @@ def _check_count(coefficients: Tensor) -> None:
     if count not in COEFFICIENT_COUNTS:
         raise InputError(
             f"distortion: expected {COEFFICIENT_COUNTS} coefficients in OpenCV's order, found "
-            f"{count}; pad with zeros or drop the tilt terms"
+            f"{count}; pad with zeros"
         )
 
 
 def _padded(coefficients: Float[Tensor, "d"]) -> tuple[Tensor, ...]:
-    """The twelve coefficients as scalars, missing ones zero."""
+    """The first twelve coefficients as scalars, missing ones zero."""
     _check_count(coefficients)
-    missing = coefficients.new_zeros(12 - coefficients.shape[-1])
-    return torch.cat([coefficients, missing]).unbind(-1)
+    missing = coefficients.new_zeros(max(0, 12 - coefficients.shape[-1]))
+    return torch.cat([coefficients[:12], missing]).unbind(-1)
+
+
+def _tilt(coefficients: Float[Tensor, "d"]) -> Float[Tensor, "3 3"] | None:
+    """Homography of the tilted sensor; None where it stands upright."""
+    return tilt_matrix(coefficients[12:]) if coefficients.shape[-1] == 14 else None
 
 
 def _radial(r2: Tensor, k: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
@@ -51,7 +58,8 @@ def distort(
 
     Args:
         points: ideal points (x/z, y/z), camera axes, no unit, *b 2.
-        coefficients: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; 0, 4, 5, 8 or 12 of them.
+        coefficients: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [τx τy]]]]; 0, 4, 5, 8, 12
+            or 14 of them.
 
     Returns:
         Distorted points, *b 2. Differentiable in both arguments.
@@ -70,9 +78,11 @@ def distort(
     from kornia.geometry.calibration import distort_points
 
     _check_count(coefficients)
+    tilt, coefficients = _tilt(coefficients), coefficients[:12]
     # kornia works on pixels: the plane z = 1 is the image of the identity intrinsics
     flat, eye = points.reshape(1, -1, 2), torch.eye(3, dtype=points.dtype, device=points.device)
-    return distort_points(flat, eye[None], coefficients[None]).reshape(points.shape)
+    bent = distort_points(flat, eye[None], coefficients[None]).reshape(points.shape)
+    return bent if tilt is None else map_plane(bent, tilt)[0]
 
 
 def distortion_jacobian(
@@ -104,7 +114,10 @@ def distortion_jacobian(
     du_dx = factor + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x + prism_u * x
     dv_dy = factor + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x + prism_v * y
     rows = [du_dx, shared + prism_u * y, shared + prism_v * x, dv_dy]
-    return torch.stack(rows, -1).unflatten(-1, (2, 2))
+    jac, tilt = torch.stack(rows, -1).unflatten(-1, (2, 2)), _tilt(coefficients)
+    if tilt is None:
+        return jac
+    return map_plane_jacobian(distort(points, coefficients[:12]), tilt) @ jac
 
 
 def fold_radius(coefficients: Float[Tensor, "d"]) -> float:
@@ -113,7 +126,7 @@ def fold_radius(coefficients: Float[Tensor, "d"]) -> float:
     Inside this disc the symmetric part of the Jacobian is positive definite, and a map with that
     property on a convex set is injective. For radial lenses the radius is the exact first root of
     d(r f)/dr (or pole of f); with tangential or prism terms it is searched along 72 rays, rounded
-    down, and at most `MAX_RADIUS`.
+    down, and at most `MAX_RADIUS`. A tilt does not fold.
 
     Args:
         coefficients: as in `distort`.
@@ -127,7 +140,8 @@ def fold_radius(coefficients: Float[Tensor, "d"]) -> float:
     >>> round(fold_radius(torch.tensor([-0.1, 0.0, 0.0, 0.0], dtype=torch.float64)), 4)
     1.8257
     """
-    return _fold_radius(tuple(coefficients.detach().to("cpu", torch.float64).tolist()))
+    _check_count(coefficients)
+    return _fold_radius(tuple(coefficients[:12].detach().to("cpu", torch.float64).tolist()))
 
 
 @lru_cache(maxsize=256)
@@ -180,7 +194,9 @@ def distort_extended(
     limit = min(radius, 1e3)
     # the clamp keeps sqrt away from 0, where its gradient is infinite
     stretch = torch.sqrt(points.square().sum(-1, keepdim=True).clamp_min(limit**2)) / limit
-    return distort(points / stretch, coefficients) * stretch
+    tilt, coefficients = _tilt(coefficients), coefficients[:12]
+    bent = distort(points / stretch, coefficients) * stretch
+    return bent if tilt is None else map_plane(bent, tilt)[0]
 
 
 def undistort(
@@ -215,6 +231,10 @@ def undistort(
     if coefficients.shape[-1] == 0:
         return points, torch.ones_like(points[..., 0], dtype=torch.bool)
     limit = fold_radius(coefficients) if radius is None else radius
+    tilt, exists = _tilt(coefficients), torch.ones_like(points[..., 0], dtype=torch.bool)
+    if tilt is not None:  # a homography has an exact inverse; what is left is the lens of 12
+        points, exists = map_plane(points, torch.linalg.inv(tilt))
+        coefficients = coefficients[:12]
     # strictly inside: at the fold itself the Jacobian is singular
     inner = min(limit * (1 - 1e-6), 1e3)
     target, fixed = points.detach(), coefficients.detach()
@@ -223,13 +243,15 @@ def undistort(
         ideal = _first_guess(target, fixed, min(inner, MAX_RADIUS))
         for _ in range(steps):
             error = distort(ideal, fixed) - target
-            ideal = _into_disc(ideal - _solve(distortion_jacobian(ideal, fixed), error), inner)
+            ideal = _into_disc(
+                ideal - solve_two_by_two(distortion_jacobian(ideal, fixed), error), inner
+            )
         error = (distort(ideal, fixed) - target).abs().amax(-1)
-        valid = error <= tolerance * (1 + target.abs().amax(-1))
+        valid = exists & (error <= tolerance * (1 + target.abs().amax(-1)))
         jac = distortion_jacobian(ideal, fixed)
     if torch.is_grad_enabled() and (points.requires_grad or coefficients.requires_grad):
         # one more Newton step whose value changes nothing carries the implicit derivative
-        step = _solve(jac, distort(ideal, coefficients) - points)
+        step = solve_two_by_two(jac, distort(ideal, coefficients) - points)
         ideal = ideal - torch.where(valid[..., None], step, torch.zeros_like(step))
     return ideal, valid
 
@@ -253,13 +275,3 @@ def _into_disc(points: Float[Tensor, "*b 2"], radius: float) -> Float[Tensor, "*
     """Pulls points beyond the radius back onto it, along their ray."""
     norm = points.norm(dim=-1, keepdim=True)
     return points * (radius / norm.clamp_min(radius))
-
-
-def _solve(jac: Float[Tensor, "*b 2 2"], right: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
-    """Solves 2×2 systems by Cramer's rule; singular ones give finite values."""
-    (a, b), (c, d) = (row.unbind(-1) for row in jac.unbind(-2))
-    x, y = right.unbind(-1)
-    det = a * d - b * c
-    tiny = torch.finfo(jac.dtype).eps ** 2
-    safe = torch.where(det.abs() > tiny, det, torch.full_like(det, tiny))
-    return torch.stack([d * x - b * y, a * y - c * x], -1) / safe[..., None]

@@ -4,7 +4,8 @@ import numpy as np
 import torch
 
 from monopart.geometry.body import BodyPose
-from monopart.geometry.cameras import Camera, orbit_cameras
+from monopart.geometry.camera_paths import orbit_cameras
+from monopart.geometry.cameras import Camera
 from monopart.geometry.errors import InputError
 
 from .avatar import Avatar, View

@@ -16,12 +16,15 @@ from .ablate_arguments import Ablate, ProtocolName
 from .config import Config
 from .overrides import overridden
 from .presets import preset, preset_names
+from .reading_arguments import AS_IT_IS, Flags
+from .replay_arguments import Replay
+from .reproduce_arguments import Reproduce
 from .skipping import EVERY, KINDS
 
 PROGRAM = """Animatable avatars from monocular video.
 
-CAPTURE is a folder in the layout of ZJU-MoCap; RUN is a folder that training makes. Results go to
-stdout, progress to stderr. Bad input: one line and exit code 2; interrupt: 130.
+CAPTURE is a folder in the layout of ZJU-MoCap or MonoCap; RUN is a folder that training makes.
+Results go to stdout, progress to stderr. Bad input: one line and exit code 2; interrupt: 130.
 
 What takes long to prepare is kept in ~/.cache/monopart/frames (XDG_CACHE_HOME is heeded), at most
 in 4 GB. MONOPART_CACHE names another folder, or "off"; MONOPART_CACHE_GB another limit; monopart
@@ -70,10 +73,8 @@ class Train:
     """Steps of training; not together with --seconds."""
     seed: Annotated[int | None, arg(metavar="K", help_behavior_hint=OF_PRESET)] = None
     """Seed of initial values, batches and jitter, from 0."""
-    params: Annotated[
-        str | None, arg(metavar="NAME", help_behavior_hint="(default: new_params, else params)")
-    ] = None
-    """Folder of body poses inside the capture."""
+    reading: Flags = AS_IT_IS
+    """How the capture is read."""
     set: Settings = ()
     """Entries of the configuration to replace, such as train.rays=512; config.json lists them."""
     images: MaybeImages = None
@@ -100,7 +101,7 @@ class Train:
             self.capture,
             self.out,
             config,
-            params=self.params,
+            reading=self.reading.reading(),
             extras=commands.Extras(
                 self.images, self.explain, self.profile, self.device, self.protocols
             ),
@@ -251,26 +252,14 @@ class Info:
 
     path: Annotated[Positional[Path], arg(metavar="CAPTURE|RUN")]
     """Folder of a capture or of a run."""
+    reading: Flags = AS_IT_IS
+    """How a capture is read."""
 
     def run(self) -> None:
         """Do it."""
         from . import commands
 
-        commands.info(self.path)
-
-
-@dataclass(frozen=True)
-class Replay:
-    """Repeat a training step that was not finite, from the file that the training wrote."""
-
-    file: tyro.conf.Positional[Path]
-    """File in a run's folder culprits."""
-
-    def run(self) -> None:
-        """Print what was found then, and what is found now."""
-        from .replay import replay
-
-        replay(self.file)
+        commands.info(self.path, self.reading.reading())
 
 
 @dataclass(frozen=True)
@@ -302,7 +291,7 @@ class Demo:
         commands.demo(self.capture, self.out, config, self.device)
 
 
-Command = Train | Eval | Render | Turntable | Info | Demo | Replay | Ablate
+Command = Train | Eval | Render | Turntable | Info | Demo | Replay | Ablate | Reproduce
 _Commands = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
@@ -312,6 +301,7 @@ _Commands = (
     | Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
     | Annotated[Ablate, tyro.conf.subcommand("ablate")]
+    | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
 )
 
 

@@ -1,6 +1,6 @@
 """A trained person: model, capture and pose memory; what rendering and evaluation need."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -62,6 +62,11 @@ class Avatar:
     def device(self) -> torch.device:
         """Where bodies and model are."""
         return self.canonical.verts.device
+
+    def for_test(self) -> "Avatar":
+        """The same person with the cameras and images at the size at which they are compared."""
+        record = self.record.for_test()
+        return self if record is self.record else replace(self, record=record)
 
     def scene(self, frames: tuple[int, ...]) -> SceneBodies:
         """Posed bodies of frames of the capture."""

@@ -18,7 +18,7 @@ from .animate import as_uint8, pose_of, turntable_views
 from .avatar import Avatar, View
 from .cache import user_cache
 from .capacity import allocated, capacity_lines
-from .captures import check_capture, describe, read_capture
+from .captures import Reading, check_capture, describe, read_capture
 from .captures.cache import read_pictures
 from .choices import Choices, Extras
 from .config import Config
@@ -72,7 +72,7 @@ def train(
     capture: Path,
     out: Path,
     config: Config,
-    params: str | None = None,
+    reading: Reading | None = None,
     extras: Extras | None = None,
     resume: bool = False,
 ) -> Path:
@@ -84,7 +84,7 @@ def train(
         capture: folder of the capture.
         out: run folder to make.
         config: the resolved configuration.
-        params: name of the folder of body poses, None for the capture's own.
+        reading: how the capture is read: body track, subject, sizes.
         extras: what is done beside the training, and where.
         resume: go on with an unfinished run in ``out``, with its own configuration.
 
@@ -97,11 +97,11 @@ def train(
     """
     stages, extras = Stages(), extras or Extras()
     device = pick_device(extras.device)
-    trainer = _trainer(capture, out, config, params, stages, device, resume)
+    trainer = _trainer(capture, out, config, reading, stages, device, resume)
     if extras.profile:
         _profile(trainer, out)
     interrupted = _train(trainer, stages)
-    avatar, result = trainer.avatar, trainer.result
+    avatar, result = trainer.avatar.for_test(), trainer.result
     if extras.explain:
         print_savings("What skipping saves in a training step", training_savings(trainer))
     with stages.timed("evaluation"):
@@ -136,7 +136,7 @@ def demo(capture: Path, out: Path, config: Config, device: str = "cpu") -> Path:
         say(f"{out} exists; this run goes to {run}")
     trainer = _trainer(capture, run, config, None, stages, there)
     interrupted = _train(trainer, stages)
-    avatar, result = trainer.avatar, trainer.result
+    avatar, result = trainer.avatar.for_test(), trainer.result
     with stages.timed("evaluation"):
         evaluations = evaluate_splits(avatar, held_out(avatar.record), None)
     with stages.timed("turntable video"):
@@ -155,18 +155,18 @@ def _trainer(
     capture: Path,
     out: Path,
     config: Config,
-    params: str | None,
+    reading: Reading | None,
     stages: Stages,
     device: torch.device,
     resume: bool = False,
 ) -> Trainer:
     """Everything that a training needs, read and prepared; the run folder is made."""
     if resume:
-        config, params = resumable(out)
+        config, reading = resumable(out)
     else:
         check_free(out)
     with stages.timed("reading and body geometry"), progress_bar("Reading", True) as update:
-        record, cache = read_capture(capture, params=params), user_cache(say)
+        record, cache = read_capture(capture, reading=reading), user_cache(say)
         pictures = read_pictures(
             record, "train", cache, lambda i, n: update(0.6 * i / n, f"image {i}/{n}")
         )
@@ -252,7 +252,8 @@ def evaluate(
         protocols: names of protocols; ``strict`` is always one.
         truth: name of a folder of exact body poses: the joint error against it is printed.
     """
-    avatar, stages = open_run(run, capture, pick_device(device)), Stages()
+    avatar = open_run(run, capture, pick_device(device)).for_test()
+    stages = Stages()
     path = run / "training.json"
     whole = images is None and split is None and path.is_file()
     training = _training_facts(path) if whole else None
@@ -372,11 +373,12 @@ def turntable(
     print(out)
 
 
-def info(path: Path) -> None:
+def info(path: Path, reading: Reading | None = None) -> None:
     """Print the facts of a capture or of a run as JSON.
 
     Args:
         path: folder of a capture or of a run.
+        reading: how a capture is read.
     """
     facts: dict[str, Any]
     if (path / "config.json").is_file():
@@ -385,7 +387,7 @@ def info(path: Path) -> None:
             file = path / f"{name}.json"
             facts[name] = read_facts(file) if file.is_file() else None
     else:
-        record = read_capture(path)
+        record = read_capture(path, reading=reading)
         facts = describe(record) | {"check": dataclasses.asdict(check_capture(record, deep=True))}
     facts["cache"] = user_cache(say).facts()
     print(json.dumps(facts, indent=2, default=str))

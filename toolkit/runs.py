@@ -1,5 +1,6 @@
 """Run folders: made once, read back strictly."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from monopart.geometry.errors import InputError
 from .atomic import write_json, write_text
 from .avatar import Avatar
 from .cache import user_cache
-from .captures import read_capture
+from .captures import Reading, read_capture
 from .captures.records import CaptureRecord
 from .checkpoint import WEIGHTS, load_weights
 from .config import Config, from_json, to_json
@@ -48,8 +49,8 @@ def next_free(out: Path) -> Path:
     return path
 
 
-def resumable(run: Path) -> tuple[Config, str | None]:
-    """Configuration and body track of a run that is to go on.
+def resumable(run: Path) -> tuple[Config, Reading]:
+    """Configuration of a run that is to go on, and how its capture was read.
 
     Raises:
         InputError: the folder is not a run.
@@ -60,7 +61,27 @@ def resumable(run: Path) -> tuple[Config, str | None]:
             "name the folder given to --out when it began"
         )
     config = from_json(run / "config.json")
-    return config, read_facts(run / "capture.json").get("params")
+    return config, _reading(read_facts(run / "capture.json"))
+
+
+def _reading(facts: dict[str, Any]) -> Reading:
+    """How the capture of a run was read; a run of an earlier version says only its body track."""
+    names = {f.name for f in dataclasses.fields(Reading)}
+    return Reading(**{name: value for name, value in facts.items() if name in names})
+
+
+def _capture_facts(record: CaptureRecord) -> dict[str, Any]:
+    """Where a capture is, and how it was read."""
+    body = record.body_path
+    how = Reading(
+        params=record.params,
+        body=None if body is None else str(body.resolve()),
+        subject=record.subject,
+        scale=record.scale,
+        test_scale=record.test_scale,
+        legacy_pixels=record.legacy_pixels,
+    )
+    return {"path": str(record.root.resolve()), **dataclasses.asdict(how)}
 
 
 def read_facts(path: Path) -> dict[str, Any]:
@@ -104,7 +125,7 @@ def create_run(out: Path, config: Config, record: CaptureRecord) -> Path:
     except OSError as error:
         raise InputError(f"--out {out}: cannot make the folder ({error.strerror})") from None
     write_text(out / "config.json", to_json(config))
-    write_json(out / "capture.json", {"path": str(record.root.resolve()), "params": record.params})
+    write_json(out / "capture.json", _capture_facts(record))
     device = str(record.body.v_template.device)
     write_json(out / "environment.json", environment_facts() | {"device": device})
     return out
@@ -132,10 +153,11 @@ def open_run(run: Path, capture: Path | None = None, device: torch.device = CPU)
     if not (run / WEIGHTS).is_file():
         raise InputError(f"{run / WEIGHTS}: expected trained weights, found no file; train first")
     config = from_json(run / "config.json")
-    params = None
+    reading = None
     if (run / "capture.json").is_file():
         stored = read_facts(run / "capture.json")
         path, params = stored.get("path"), stored.get("params")
+        reading = _reading(stored)
         if not (isinstance(path, str) and isinstance(params, str)):
             raise InputError(
                 f"{run / 'capture.json'}: expected texts path and params, found {stored}; "
@@ -151,7 +173,7 @@ def open_run(run: Path, capture: Path | None = None, device: torch.device = CPU)
         raise InputError(
             f"{capture}: expected the capture of {run}, found nothing; name it by --capture"
         )
-    record = read_capture(capture, params=params).to(device)
+    record = read_capture(capture, reading=reading).to(device)
     torch.manual_seed(config.seed)
     avatar = Avatar.create(record, config, user_cache())
     load_weights(avatar.model, run)

@@ -10,7 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monopart.geometry.cameras import MIN_DEPTH, Camera, Rays, orbit_cameras
+from monopart.geometry.camera_paths import orbit_cameras
+from monopart.geometry.cameras import MIN_DEPTH, Camera, Rays
 from monopart.geometry.errors import InputError
 
 F64 = torch.float64
@@ -20,6 +21,7 @@ COEFFICIENTS = {
     5: [-0.2, 0.03, 0.0006, -0.0004, 0.002],
     8: [-0.2, 0.03, 0.0006, -0.0004, 0.002, 0.05, -0.01, 0.003],
     12: [-0.2, 0.03, 0.0006, -0.0004, 0.002, 0.05, -0.01, 0.003, 0.002, -0.001, 0.0015, 0.0007],
+    14: [-0.2, 0.03, 6e-4, -4e-4, 0.002, 0.05, -0.01, 0.003, 0.002, -1e-3, 0.0015, 7e-4, 0.1, -0.2],
 }
 MATRIX = [[537.1, 0.0, 251.3], [0.0, 536.2, 247.9], [0.0, 0.0, 1.0]]
 
@@ -314,7 +316,9 @@ def test_rays_at():
         ({"size": (0, 4)}, "size: expected positive"),
         ({"size": (4, -1)}, "size: expected positive"),
         ({"distortion": torch.zeros(3)}, "distortion: expected"),
-        ({"distortion": torch.zeros(14)}, "distortion: expected"),
+        ({"distortion": torch.zeros(13)}, "distortion: expected"),
+        ({"lens": "pinhole"}, "lens: expected brown or fisheye"),
+        ({"lens": "fisheye", "distortion": torch.zeros(5)}, "distortion: expected"),
         ({"distortion": torch.zeros(5, 1)}, "distortion: expected shape"),
     ],
 )

@@ -282,7 +282,7 @@ TOOLKIT = (
     Mutant(
         "translations of a capture",
         "wrong unit",
-        "toolkit/captures/zju_mocap.py",
+        "toolkit/captures/annots.py",
         "T.reshape(-1) / 1000",
         "T.reshape(-1) / 100",
         _toolkit("captures"),

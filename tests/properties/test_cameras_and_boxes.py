@@ -10,7 +10,8 @@ from motions import Motion, close, generator, motions, normal, seeds, shuffled, 
 from torch import Tensor
 
 from monopart.geometry.boxes import box_of, in_box, ray_box
-from monopart.geometry.cameras import Camera, Rays, orbit_cameras
+from monopart.geometry.camera_paths import orbit_cameras
+from monopart.geometry.cameras import Camera, Rays
 
 PIXELS = 1e-9  # float64
 FAR = 0.02  # pixels at 60 pixels per metre of depth 3: roundings of 7.6e-6 m at 100 m

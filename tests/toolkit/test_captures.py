@@ -11,8 +11,8 @@ from miniature import NAMES, pose_body, read_default_body, write_miniature
 
 from monopart.geometry.errors import InputError
 from monopart.toolkit.captures import CaptureRecord, check_capture, describe, read_capture
+from monopart.toolkit.captures.frames import Split
 from monopart.toolkit.captures.images import read_mask
-from monopart.toolkit.captures.records import Split
 from monopart.toolkit.captures.splits import read_splits
 
 LENS = (-0.6, 0.3, 0.01, -0.01, 0.0)

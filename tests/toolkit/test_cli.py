@@ -21,7 +21,8 @@ from monopart.toolkit.train import Trainer
 
 pytestmark = pytest.mark.usefixtures("short_strip")
 SNAPSHOT = Path(__file__).parents[1] / "snapshots" / "cli_help.txt"
-COMMANDS = ("train", "eval", "render", "turntable", "info", "demo", "ablate")
+COMMANDS = ("train", "eval", "render", "turntable", "info", "demo")
+COMMANDS += ("replay", "ablate", "reproduce")
 FILES = {
     "config.json",
     "capture.json",

@@ -14,6 +14,7 @@ from monopart.toolkit.cache import NO_CACHE, Cache, Tensors
 
 from . import images as images_code
 from . import records as records_code
+from . import scaling as scaling_code
 from .patches import mask_box
 from .records import CaptureRecord, Progress, run_all
 
@@ -56,10 +57,10 @@ def read_pictures(
     lenses = [record.raw_cameras[c] for c in record.split(split).cameras]
     inputs = (
         [path for frame in frames for path in (frame.image_path, frame.mask_path)],
-        list(record.image_size),
+        [*record.image_size, *record.stored_size, record.legacy_pixels, record.resize_masks],
         [[lens.K, lens.distortion] for lens in lenses if lens.is_distorted],
         [cv2.__version__, np.__version__, split == "train"],
-        [images_code, records_code, sys.modules[__name__]],
+        [images_code, records_code, scaling_code, sys.modules[__name__]],
     )
 
     def unpack(tensors: Tensors) -> Pictures:

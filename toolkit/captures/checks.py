@@ -10,8 +10,9 @@ from torch import Tensor
 
 from monopart.geometry.errors import InputError
 
+from .frames import Split
 from .images import describe_size
-from .records import CaptureRecord, Progress, Split, check_not_empty, run_all
+from .records import CaptureRecord, Progress, check_not_empty, run_all
 
 MAX_VERTEX_ERROR = 5e-3
 """Metres between stored and posed vertices from which on conventions must differ."""
@@ -98,7 +99,10 @@ def describe(record: CaptureRecord) -> dict[str, Any]:
         "folder": str(record.root),
         "frames": len({f for _, f in record.frames}),
         "cameras": list(record.camera_names),
+        "subject": record.subject,
         "image_size": list(record.image_size),
+        "stored_size": list(record.stored_size),
+        "test_size": list(record.for_test().image_size),
         "fps": record.fps,
         "splits": {name: _split_facts(split) for name, split in record.splits.items()},
         "body": {

@@ -15,53 +15,24 @@ from monopart.geometry.body import BodyModel, BodyPose
 from monopart.geometry.cameras import Camera
 from monopart.geometry.errors import InputError
 
-from .images import describe_size, read_image, read_mask, read_vertices
+from .frames import Frame, Split, check_sizes
+from .images import read_image, read_mask, read_vertices
+from .scaling import camera_at, scale_image, scale_mask, scaled_size
 
 Progress = Callable[[int, int], None]
 """Called with (done, total) as files are read."""
 
-
-@dataclass(frozen=True)
-class Frame:
-    """One picture: a frame number, a camera, and where image and mask lie."""
-
-    index: int
-    """Frame number: the stem of the image file."""
-    camera: int
-    """Position of the camera in the record."""
-    image_path: Path
-    """8 bit colour image."""
-    mask_path: Path
-    """Mask of the same size."""
-
-
-@dataclass(frozen=True)
-class Split:
-    """Cameras and frames that belong together; every camera is used at every frame."""
-
-    cameras: tuple[int, ...]
-    """Positions of cameras."""
-    frames: tuple[int, ...]
-    """Frame numbers."""
-
-    def pairs(self) -> list[tuple[int, int]]:
-        """All (camera, frame) of the split, camera by camera.
-
-        Returns:
-            The pairs, in the order in which `CaptureRecord.stack` returns images.
-
-        >>> Split((0, 2), (5, 6)).pairs()
-        [(0, 5), (0, 6), (2, 5), (2, 6)]
-        """
-        return [(c, f) for c in self.cameras for f in self.frames]
+KEPT_BYTES = 1 << 29
+"""Undistorted and scaled pixels that a record holds in memory at most."""
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureRecord:
     """A capture in house conventions: metres, pixel centres at +½, RGB, undistorted images.
 
-    Images are read when asked for. Those of a distorted camera are undistorted once and then kept
-    in memory; those of a camera without distortion are passed on as they are.
+    Images are read when asked for. Those of a distorted camera are undistorted, and then scaled
+    where the record has another size than the files; what took such work stays in memory, up to
+    `KEPT_BYTES`. Others are passed on as they are.
     """
 
     root: Path
@@ -69,7 +40,7 @@ class CaptureRecord:
     name: str
     """Name of the folder."""
     cameras: list[Camera]
-    """Cameras of the undistorted images: float32, distortion zero."""
+    """Cameras of the undistorted images of `image_size`: float32, distortion zero."""
     camera_names: list[str]
     """Name of each camera, from the folder of its images."""
     poses: dict[int, BodyPose]
@@ -81,7 +52,7 @@ class CaptureRecord:
     fps: float | None
     """Frames per second; None where the capture does not say."""
     image_size: tuple[int, int]
-    """(height, width) of every image, pixels."""
+    """(height, width) of every image as it is given out, pixels."""
     frames: dict[tuple[int, int], Frame]
     """Files of each (camera, frame)."""
     raw_cameras: list[Camera]
@@ -90,6 +61,18 @@ class CaptureRecord:
     """Folder of the body track that was read."""
     vertex_paths: dict[int, Path] = field(default_factory=dict)
     """Stored body vertices of each frame, world metres; empty where the capture has none."""
+    scale: float = 1.0
+    """Size of the images of this record, of the stored size."""
+    test_scale: float = 1.0
+    """Size at which images are compared, of the stored size; see `for_test`."""
+    legacy_pixels: bool = False
+    """Images are scaled as the authors of the data sets do (`camera_at`)."""
+    resize_masks: bool = False
+    """Masks of another size are brought to that of their image; they are refused otherwise."""
+    subject: str | None = None
+    """Name of the subject of a public data set whose splits these are."""
+    body_path: Path | None = None
+    """Body file that was asked for; None for the capture's own or the package's."""
     _cache: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = field(
         default_factory=dict, repr=False
     )
@@ -111,6 +94,39 @@ class CaptureRecord:
             poses={frame: pose.to(like) for frame, pose in self.poses.items()},
             cameras=[camera.to(like) for camera in self.cameras],
         )
+
+    @property
+    def stored_size(self) -> tuple[int, int]:
+        """(height, width) of the image files, pixels."""
+        return self.raw_cameras[0].size
+
+    def scaled(self, scale: float) -> "CaptureRecord":
+        """The same capture with images and cameras of another size.
+
+        Args:
+            scale: of the stored size, above 0 and at most 1.
+
+        Returns:
+            The capture; itself where nothing changes.
+
+        Raises:
+            InputError: a factor that is not above 0 and at most 1.
+        """
+        if scale == self.scale:
+            return self
+        cameras = [camera_at(c, scale, self.legacy_pixels) for c in self.raw_cameras]
+        like = self.cameras[0].K
+        return replace(
+            self,
+            cameras=[camera.to(like) for camera in cameras],
+            image_size=scaled_size(self.stored_size, scale, self.legacy_pixels),
+            scale=scale,
+            _cache={},
+        )
+
+    def for_test(self) -> "CaptureRecord":
+        """The same capture at the size at which its images are compared."""
+        return self.scaled(self.test_scale)
 
     def split(self, name: str) -> Split:
         """A split by name.
@@ -291,17 +307,35 @@ class CaptureRecord:
         run_all(keep, len(pairs), progress)
 
     def _pixels(self, camera: int, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """RGB uint8 (h, w, 3) and mask bool (h, w), undistorted."""
+        """RGB uint8 (h, w, 3) and mask bool (h, w), undistorted and scaled."""
         kept = self._cache.get((camera, frame))
         if kept is not None:
             return kept
         entry = self.frame(camera, frame)
         rgb, on = read_image(entry.image_path), read_mask(entry.mask_path)
-        _check_sizes(entry, rgb, on, self.image_size)
-        if self.raw_cameras[camera].is_distorted:
+        if self.resize_masks and on.shape != rgb.shape[:2]:
+            on = scale_mask(on, rgb.shape[:2], nearest=True)
+        check_sizes(entry, rgb, on, self.stored_size)
+        distorted = self.raw_cameras[camera].is_distorted
+        if distorted:
             rgb, on = self._undistort(camera, rgb, on)
-            self._cache[camera, frame] = rgb, on
+        if self.image_size != self.stored_size:
+            rgb = scale_image(rgb, self.image_size)
+            on = scale_mask(on, self.image_size, nearest=self.legacy_pixels)
+        elif not distorted:
+            return rgb, on
+        self._keep((camera, frame), (rgb, on))
         return rgb, on
+
+    def _keep(self, pair: tuple[int, int], pixels: tuple[np.ndarray, np.ndarray]) -> None:
+        """Hold pixels in memory, and let go of those that came first."""
+        size = pixels[0].nbytes + pixels[1].nbytes
+        while self._cache and (len(self._cache) + 1) * size > KEPT_BYTES:
+            try:
+                self._cache.pop(next(iter(self._cache)), None)
+            except (StopIteration, RuntimeError):  # another thread was faster
+                break
+        self._cache[pair] = pixels
 
     def _undistort(
         self, camera: int, rgb: np.ndarray, on: np.ndarray
@@ -314,20 +348,6 @@ class CaptureRecord:
         x, y = self._maps[camera]
         soft = cv2.remap(on.astype(np.uint8) * 255, x, y, cv2.INTER_LINEAR)
         return cv2.remap(rgb, x, y, cv2.INTER_LINEAR), np.asarray(soft > 127)
-
-
-def _check_sizes(entry: Frame, rgb: np.ndarray, on: np.ndarray, size: tuple[int, int]) -> None:
-    """Refuses an image that is not of the capture's size, and a mask not of the image's."""
-    if rgb.shape[:2] != size:
-        raise InputError(
-            f"{entry.image_path}: expected {describe_size(size)} as the other images, found "
-            f"{describe_size(rgb.shape)}; K belongs to one size, so resize the image"
-        )
-    if on.shape != size:
-        raise InputError(
-            f"{entry.mask_path}: expected {describe_size(size)} as its image, found "
-            f"{describe_size(on.shape)}; resize the mask (nearest neighbour)"
-        )
 
 
 def check_not_empty(record: CaptureRecord, pair: tuple[int, int], on: Bool[Tensor, "h w"]) -> None:

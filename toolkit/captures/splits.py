@@ -5,13 +5,21 @@ from pathlib import Path
 
 from monopart.geometry.errors import InputError
 
-from .records import Split
+from .frames import Split
+from .subjects import (
+    FRAME_STEP,
+    NOVEL_POSE_FRAMES,
+    NOVEL_VIEW_STEP,
+    ON_TRAINING_CAMERA,
+    TRAIN_FRAMES,
+    Subject,
+)
 
 TRAIN_CAMERA = 4
 """The data set's own choice for monocular training."""
 FALLBACK_CAMERA = 0
 """Training camera of a capture with fewer cameras."""
-STEP, TRAIN_SPAN, NOVEL_VIEW_STEP = 5, 500, 6  # frames; frames; training frames
+STEP, TRAIN_SPAN = FRAME_STEP, FRAME_STEP * TRAIN_FRAMES
 
 Pictures = dict[tuple[int, int], str]
 """Path of the image of each (camera, frame), relative to the capture."""
@@ -100,3 +108,58 @@ def _default_splits(pictures: Pictures, posed: set[int]) -> dict[str, Split]:
         "novel_pose": Split(others, later),
     }
     return {name: split for name, split in splits.items() if split.pairs()}
+
+
+def subject_splits(
+    root: Path, person: Subject, pictures: Pictures, posed: set[int]
+) -> dict[str, Split]:
+    """The splits of a subject of the public data sets, complete or refused.
+
+    Args:
+        root: folder of the capture.
+        person: the subject.
+        pictures: relative path of the image of each (camera, frame).
+        posed: frames that have a body pose.
+
+    Returns:
+        `train`, `novel_view` and, where the capture goes on after the training frames, `novel_pose`
+        (held-out cameras) and `novel_pose_training_camera`.
+
+    Raises:
+        InputError: a camera, frame or body pose of the protocol is missing.
+    """
+    numbers = {f for _, f in pictures}
+    first = min(numbers)
+    if first not in (0, 1):  # the releases count from one of the two
+        raise _incomplete(root, person, f"frames from {person.first_frame}", f"frame {first} first")
+    train = tuple(range(first, first + STEP * TRAIN_FRAMES, STEP))
+    after = first + STEP * TRAIN_FRAMES
+    later = tuple(range(after, max(numbers) + 1, STEP))[:NOVEL_POSE_FRAMES]
+    chosen, others = (person.train_camera,), person.test_cameras
+    splits = {
+        "train": Split(chosen, train),
+        "novel_view": Split(others, train[::NOVEL_VIEW_STEP]),
+        "novel_pose": Split(others, later),
+        ON_TRAINING_CAMERA: Split(chosen, later),
+    }
+    cameras = {c for c, _ in pictures}
+    for name, split in splits.items():
+        for camera in split.cameras:
+            if camera not in cameras:
+                found = f"cameras 0 to {max(cameras)}"
+                raise _incomplete(root, person, f"camera {camera} ({name})", found)
+        for frame in split.frames:
+            if frame not in posed and frame in numbers:
+                raise _incomplete(root, person, f"body parameters {frame}.npy ({name})", "no file")
+        for camera, frame in split.pairs():
+            if (camera, frame) not in pictures:
+                wanted = f"camera {camera} at frame {frame} in annots.npy ({name})"
+                raise _incomplete(root, person, wanted, "none")
+    return {name: split for name, split in splits.items() if split.pairs()}
+
+
+def _incomplete(root: Path, person: Subject, wanted: str, found: str) -> InputError:
+    return InputError(
+        f"{root}: expected {wanted} of subject {person.name}, found {found}; restore the data set, "
+        f"or describe what there is in splits.json"
+    )
