@@ -148,11 +148,11 @@ class RefineConfig:
     """Training frames that the random pixels of a step come from."""
     start: float = 0.02
     """Part of the run after which corrections begin."""
-    rigid: float = 0.5
+    rigid: float = 0.4
     """Part of the run without residuals, which would otherwise explain wrong poses."""
     lr: float = 2e-3
     """Learning rate of rotations, radians; translations take 0.3 of it in metres."""
-    prior: float = 1e-5
+    prior: float = 5e-6
     """Weight of the mean squared correction, in units of 0.03 rad, 0.01 m and 1 of shape."""
     smooth: float = 1e-5
     """Weight of the mean squared second difference of the corrections in time, same units."""
