@@ -34,10 +34,11 @@ BARE = FieldConfig(prior_slope=0.0, allocation="data")
 
 def _published() -> dict[str, Config]:
     """The paper as it is written, and the conventions of the authors' code."""
-    # The appearance of the paper (codes, pose features, fusion) goes here: appearance=...
+    appearance = AppearanceConfig(pose_feature=True, density_sees_fusion=True, blend_time=True)
     paper = Config(
         preset="paper",
         field=BARE,
+        appearance=appearance,
         loss=LossConfig(lpips=1.0, consistency_threshold=0.05, consistency_samples=ALL, offset=0.0),
         train=SLOW,
     )
@@ -77,7 +78,8 @@ def _presets() -> dict[str, Config]:
     )
     tiny = Config(preset="tiny", train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0))
     rigid = Config(preset="rigid", deform=DeformConfig(residual=False))
-    own = {"fast": fast, "best": best, "tiny": tiny, "rigid": rigid}
+    full = Config(preset="full", appearance=AppearanceConfig(pose_feature=True))
+    own = {"fast": fast, "best": best, "tiny": tiny, "rigid": rigid, "full": full}
     return own | _published() | _baselines()
 
 

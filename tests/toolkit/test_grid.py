@@ -8,16 +8,6 @@ from monopart.toolkit.arguments import resolve
 from monopart.toolkit.config import Config
 from monopart.toolkit.grid import FULL, PAPER, chosen, explicit, read_grid
 
-UNMERGED = (
-    "no_uvt",
-    "no_f_k",
-    "no_rgb_latent",
-    "no_pose_feature",
-    "instant_nvr",
-    "single_part",
-    "best",
-)
-
 
 def test_the_papers_grid():
     figures = {n: v.published["novel_view"] for n, v in PAPER.items() if v.published}
@@ -69,9 +59,5 @@ def test_wrong_grids(tmp_path, text, message):
 
 @pytest.mark.parametrize("name", PAPER)
 def test_every_cell_of_the_paper_resolves(name, tmp_path):
-    made = Plan((tmp_path,), tmp_path / "out", chosen(PAPER, [name]), 1, "fast", seconds=1.0)
-    if name in UNMERGED:  # entries and presets that are being written; the error is clear
-        with pytest.raises(InputError, match=f"cell {name}: --(set|preset)"):
-            cells_of(made)
-    else:
-        assert {c.name for c in cells_of(made)[0]} | set(cells_of(made)[1]) == {FULL, name}
+    made = Plan((tmp_path,), tmp_path / "out", chosen(PAPER, [name]), 1, "full", seconds=1.0)
+    assert {c.name for c in cells_of(made)[0]} | set(cells_of(made)[1]) == {FULL, name}
