@@ -36,7 +36,7 @@ class Ablate:
     """Cells to train, beside full."""
     base: Annotated[
         str, arg(metavar="NAME", help="Preset of the cells: " + ", ".join(preset_names()) + ".")
-    ] = preset_names()[0]
+    ] = "full"
     """Preset of the cells that name none."""
     grid: Annotated[
         Path | None, arg(metavar="FILE.json", help_behavior_hint="(default: the paper's)")
