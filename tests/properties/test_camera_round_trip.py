@@ -65,7 +65,7 @@ def _comes_back(camera: Camera, points: torch.Tensor, bound: float) -> None:
     assert float((again - points).abs().max()) <= bound
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(**NUMBERS)
 def test_double(kind, units, size, focal, seed) -> None:
     camera = make(kind, units, size, focal)
@@ -73,7 +73,7 @@ def test_double(kind, units, size, focal, seed) -> None:
     _comes_back(camera, _seen(camera, seed), 1e-9)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(**NUMBERS)
 def test_single(kind, units, size, focal, seed) -> None:
     camera = make(kind, units, size, focal)
@@ -82,7 +82,7 @@ def test_single(kind, units, size, focal, seed) -> None:
     _comes_back(single, _seen(camera, seed).float(), BOUND)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(**NUMBERS)
 def test_every_pixel_has_a_ray_that_returns_or_a_mask(kind, units, size, focal, seed) -> None:
     camera = make(kind, units, size, focal)
