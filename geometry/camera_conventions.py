@@ -29,8 +29,7 @@ def _need_pinhole(camera: Camera, skew: bool = False) -> None:
     slant = float(camera.K[0, 1].detach())
     if not skew and slant != 0:
         raise InputError(
-            f"camera: expected no skew, found {slant:g} pixels; this convention "
-            f"has no place for it"
+            f"camera: expected no skew, found {slant:g} pixels; this convention has no place for it"
         )
 
 
