@@ -69,7 +69,8 @@ def look_at_rotation(
     """
     forward = target - eye
     right = torch.linalg.cross(forward, up)
-    if not float(right.norm()) > 1e-6 * float(forward.norm() * up.norm()):
+    sine = right.detach().norm() / (forward.norm() * up.norm()).detach()
+    if not float(sine) > 1e-6:
         raise InputError(
             f"look_at: expected up not along the view, found up {up.tolist()} and view "
             f"{forward.tolist()}; move the target or choose another up"

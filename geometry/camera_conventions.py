@@ -26,16 +26,16 @@ def _need_pinhole(camera: Camera, skew: bool = False) -> None:
             "camera: expected a pinhole, found a lens with distortion; take undistorted()[0] and "
             "resample the image"
         )
-    if not skew and float(camera.K[0, 1]) != 0:
+    slant = float(camera.K[0, 1].detach())
+    if not skew and slant != 0:
         raise InputError(
-            f"camera: expected no skew, found {float(camera.K[0, 1]):g} pixels; this convention "
-            f"has no place for it"
+            f"camera: expected no skew, found {slant:g} pixels; this convention has no place for it"
         )
 
 
 def _rigid(matrix: Float[Tensor, "4 4"], name: str) -> tuple[Tensor, Tensor]:
     """Rotation and translation of a 4×4 matrix whose last row is (0, 0, 0, 1)."""
-    if float((matrix[3] - matrix.new_tensor([0, 0, 0, 1])).abs().max()) > 1e-6:
+    if float((matrix[3].detach() - matrix.new_tensor([0, 0, 0, 1])).abs().max()) > 1e-6:
         raise InputError(
             f"{name}: expected a last row of (0, 0, 0, 1), found {matrix[3].tolist()}; transpose it"
         )
@@ -110,7 +110,7 @@ def camera_from_opengl(
     """
     check_size(size)
     R, t = _rigid(view, "view")
-    last = projection[3]
+    last = projection[3].detach()
     if float((last - projection.new_tensor([0, 0, -1, 0])).abs().max()) > 1e-6:
         raise InputError(
             f"projection: expected a perspective with last row (0, 0, -1, 0), found "

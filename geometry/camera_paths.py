@@ -112,8 +112,8 @@ def blend_cameras(first: Camera, last: Camera, count: int) -> list[Camera]:
 
     >>> eye = torch.eye(3)
     >>> a, b = (Camera(eye, eye, torch.tensor([x, 0.0, 0.0]), (4, 4)) for x in (0.0, 2.0))
-    >>> [c.center[0].item() for c in blend_cameras(a, b, 3)]
-    [0.0, -1.0, -2.0]
+    >>> [c.t[0].item() for c in blend_cameras(a, b, 3)]
+    [0.0, 1.0, 2.0]
     """
     if count < 2:
         raise InputError(f"count: expected at least 2 cameras, found {count}; include both ends")

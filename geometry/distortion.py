@@ -126,7 +126,7 @@ def fold_radius(coefficients: Float[Tensor, "d"]) -> float:
     Inside this disc the symmetric part of the Jacobian is positive definite, and a map with that
     property on a convex set is injective. For radial lenses the radius is the exact first root of
     d(r f)/dr (or pole of f); with tangential or prism terms it is searched along 72 rays, rounded
-    down, and at most `MAX_RADIUS`. A tilt does not fold.
+    down, and at most `MAX_RADIUS`. A tilted sensor ends the disc at its horizon.
 
     Args:
         coefficients: as in `distort`.
@@ -141,7 +141,7 @@ def fold_radius(coefficients: Float[Tensor, "d"]) -> float:
     1.8257
     """
     _check_count(coefficients)
-    return _fold_radius(tuple(coefficients[:12].detach().to("cpu", torch.float64).tolist()))
+    return _fold_radius(tuple(coefficients.detach().to("cpu", torch.float64).tolist()))
 
 
 @lru_cache(maxsize=256)
@@ -156,16 +156,19 @@ def _fold_radius(coefficients: tuple[float, ...]) -> float:
     roots = np.concatenate([slope.trim().roots(), below.trim().roots()])
     real = roots.real[(np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))) & (roots.real > 0)]
     radius = math.sqrt(real.min()) if real.size else math.inf
-    if not any(k[2:4] + k[8:12]):
+    tilt = _tilt(exact) if any(coefficients[12:]) else None
+    if tilt is None and not any(k[2:4] + k[8:12]):
         return radius
     limit = min(radius, MAX_RADIUS)
     radii = torch.linspace(0, limit, 501, dtype=torch.float64)
     angles = torch.linspace(0, 2 * math.pi, 73, dtype=torch.float64)[:-1]
     rays = torch.stack([angles.cos(), angles.sin()], -1)
-    jac = distortion_jacobian(radii[:-1, None, None] * rays, exact)
+    jac = distortion_jacobian(radii[:-1, None, None] * rays, exact[:12])
     trace = jac[..., 0, 0] + jac[..., 1, 1]
     det = jac[..., 0, 0] * jac[..., 1, 1] - (jac[..., 0, 1] + jac[..., 1, 0]).square() / 4
     bad = ((trace <= 0) | (det <= 0)).any(-1)
+    if tilt is not None:
+        bad |= ~map_plane(distort(radii[:-1, None, None] * rays, exact[:12]), tilt)[1].all(-1)
     return float(radii[max(int(bad.float().argmax()) - 1, 1)]) if bool(bad.any()) else limit
 
 

@@ -253,3 +253,16 @@ def test_gradients_of_the_tilt():
     angles = torch.tensor([0.2, -0.1], dtype=F64, requires_grad=True)
     points = disc(0.5, 3).requires_grad_()
     assert torch.autograd.gradcheck(lambda p, a: map_plane(p, tilt_matrix(a))[0], (points, angles))
+
+
+def test_a_camera_does_not_see_beyond_the_horizon_of_its_tilt():
+    k = torch.tensor([0.0] * 12 + [0.0, 0.5], dtype=F64)
+    radius = fold_radius(k)  # the horizon lies at 1 / tan 0.5, and 72 directions are searched
+    assert 0.97 / math.tan(0.5) < radius < 1 / math.tan(0.5)
+    K = torch.tensor([[100.0, 0, 0], [0, 100, 0], [0, 0, 1]], dtype=F64)
+    size, zero = (10**6, 10**6), torch.zeros(3, dtype=F64)
+    camera = Camera(K, torch.eye(3, dtype=F64), zero, size, k).cropped((-(10**5), -(10**5), *size))
+    x = torch.linspace(-4, 4, 801, dtype=F64)
+    points = torch.stack([x, 0 * x, 0 * x + 1], -1)
+    assert torch.equal(camera.visible(points), x.abs() < radius)
+    assert bool(torch.isfinite(camera.project(points)[0]).all())

@@ -13,6 +13,7 @@ from miniature import write_miniature
 from public_miniature import SIZE, VLAD, ZJU, state, write_subject
 
 from monopart.geometry.errors import InputError
+from monopart.toolkit import cli
 from monopart.toolkit.cache import Cache
 from monopart.toolkit.captures import SUBJECTS, Reading, check_capture, read_capture, subject
 from monopart.toolkit.captures.cache import read_pictures
@@ -294,3 +295,43 @@ def test_reading_of_a_run_is_recorded(zju):
         assert getattr(again, name) == getattr(record, name)
     assert _reading({"path": "x", "params": "params"}) == Reading(params="params")
     assert dataclasses.asdict(again.splits["train"]) == dataclasses.asdict(record.splits["train"])
+
+
+@pytest.mark.parametrize(("camera", "frame"), [(5, 30), (4, 35)])
+def test_legacy_images_are_those_of_the_authors_pipeline(zju, camera, frame):
+    """cv2.undistort at the stored size, area means for images, nearest pixels for masks."""
+    record = read_capture(zju, reading=Reading(legacy_pixels=True))
+    annots = np.load(zju / "annots.npy", allow_pickle=True).item()["cams"]
+    K, D = (np.asarray(annots[key][camera], np.float64) for key in "KD")
+    entry = record.frame(camera, frame)
+    image = cv2.undistort(cv2.imread(str(entry.image_path)), K, D)
+    expected = cv2.resize(image, (18, 15), interpolation=cv2.INTER_AREA)[..., ::-1]
+    error = np.abs(255 * record.image(camera, frame).numpy() - expected)
+    assert error.mean() < 0.5 and error.max() <= 8  # its maps are rounded to 1/32 pixel
+    stored = cv2.imread(str(entry.mask_path))
+    on = cv2.undistort((stored != 0).any(-1).astype(np.uint8), K, D)
+    on = cv2.resize(on, (18, 15), interpolation=cv2.INTER_NEAREST) != 0
+    assert (record.mask(camera, frame).numpy() != on).mean() <= 0.01
+
+
+def test_memory_for_scaled_images_is_bounded(vlad, monkeypatch):
+    record = read_capture(vlad)
+    size = 15 * 18 * 4
+    monkeypatch.setattr("monopart.toolkit.captures.records.KEPT_BYTES", 3 * size)
+    first = record.image(66, 1)
+    for frame in range(1, 60, 5):
+        record.image(66, frame)
+    assert len(record._cache) == 3
+    assert torch.equal(record.image(66, 1), first)
+
+
+def test_flags_of_the_command_line(zju, capsys):
+    assert (
+        cli.main(["info", str(zju), "--subject", "393", "--scale", "1", "--test-scale", "0.6"])
+        is None
+    )
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["subject"] == "393" and facts["image_size"] == list(SIZE)
+    assert facts["test_size"] == [18, 22] and facts["params"] == "smpl_params"
+    assert cli.main(["info", str(zju), "--scale", "2"]) == 2
+    assert "scale: expected a factor above 0" in capsys.readouterr().err

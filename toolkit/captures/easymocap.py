@@ -16,12 +16,13 @@ from monopart.geometry.cameras import Camera
 from monopart.geometry.errors import InputError
 from monopart.toolkit.atomic import replacing
 
+Sizes = tuple[int, int] | Mapping[str, tuple[int, int]] | None
+"""(height, width) of all cameras, or by name; None where the file says it."""
+
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
-def read_easymocap(
-    folder: str | Path, sizes: tuple[int, int] | Mapping[str, tuple[int, int]] | None = None
-) -> dict[str, Camera]:
+def read_easymocap(folder: str | Path, sizes: Sizes = None) -> dict[str, Camera]:
     """The cameras of `intri.yml` and `extri.yml`.
 
     Args:
@@ -48,7 +49,7 @@ def read_easymocap(
     return {name: _camera(inner, outer, name, sizes) for name in names}
 
 
-def _camera(inner: "_Storage", outer: "_Storage", name: str, sizes: object) -> Camera:
+def _camera(inner: "_Storage", outer: "_Storage", name: str, sizes: Sizes) -> Camera:
     K = inner.matrix(f"K_{name}", (3, 3))
     lens = inner.lens(f"dist_{name}")
     if f"Rot_{name}" in outer:
