@@ -75,7 +75,8 @@ def test_the_baselines_differ_from_the_default_by_their_model_alone() -> None:
 
 @pytest.mark.parametrize("name", preset_names())
 def test_every_preset_takes_a_step(small_capture: Path, name: str) -> None:
-    trainer = make(small_capture, small(preset(name)))
+    # at 24 pixels the person is thinner than the band at the edge of the mask
+    trainer = make(small_capture, small(preset(name), "train.ignore_band=0"))
     numbers = trainer.step(1, 0.5)
     assert numbers["mse"] > 0 and not trainer.result.warnings
     out = trainer.avatar.model.backward_residual
