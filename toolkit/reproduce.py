@@ -97,7 +97,8 @@ def reproduce(
     Raises:
         InputError: a subject that cannot be read, or a run folder of another configuration; nothing
             was trained.
-        KeyboardInterrupt: a training was interrupted; the same command goes on.
+        KeyboardInterrupt: a training was interrupted; it was scored as it was, and its folder has
+            to go before the same command trains it again.
     """
     captures = find_subjects(folders, only)
     readings = {name: dataclasses.replace(reading, subject=name) for name in captures}
@@ -109,8 +110,7 @@ def reproduce(
     for name, capture in captures.items():
         if states[name] != "done":
             again = states[name] == "unfinished"
-            extras = Extras(images=images, device=device)
-            train(capture, out / name, config, readings[name], extras, resume=again)
+            train(capture, out / name, config, readings[name], _extras(images, device), again)
     scores = {name: read_facts(out / name / "metrics.json") for name in captures}
     facts = {
         "preset": config.preset,
@@ -124,6 +124,14 @@ def reproduce(
     return write_text(out / "table.md", page(table))
 
 
+def _extras(images: int | None, device: str) -> Extras:
+    """What is scored; the paper's protocol is among it where the evaluation has a choice."""
+    given: dict[str, Any] = {"protocols": ("strict", "legacy")}
+    known = {f.name for f in dataclasses.fields(Extras)}
+    given = {name: value for name, value in given.items() if name in known}
+    return Extras(images=images, device=device, **given)
+
+
 def _state(run: Path, config: Config) -> str:
     """How far a run is: absent, unfinished or done."""
     if not run.exists() or not any(run.iterdir()):
@@ -134,6 +142,12 @@ def _state(run: Path, config: Config) -> str:
             f"another --out, or remove that folder"
         )
     if (run / "report.html").is_file() and (run / "metrics.json").is_file():
+        warnings = read_facts(run / "training.json").get("warnings", [])
+        if any("interrupted" in text for text in warnings):
+            raise InputError(
+                f"{run}: expected a whole training, found one that was interrupted and scored as "
+                f"it was; remove the folder to train it again"
+            )
         return "done"
     if (run / STATE).is_file():
         return "unfinished"

@@ -20,7 +20,7 @@ class Reproduce:
     A subject is found by the name of its folder (my_377, lan_images620_1300, ...) or its
     capture.json, in DATA or up to two folders below. Each training is a run folder OUT/SUBJECT;
     OUT/table.md and table.json hold the means of each data set. The same command goes on where it
-    was cut short. All subjects are checked before the first one is trained.
+    died. All subjects are checked before the first one is trained.
     """
 
     data: Annotated[Positional[tuple[Path, ...]], arg(metavar="DATA ...")]

@@ -122,3 +122,11 @@ def test_the_command_trains_scores_and_goes_on(tmp_path, capsys, monkeypatch):
     assert (out / "392" / "model.safetensors").stat().st_mtime_ns == before
     assert cli.main([*command, "--seed", "3"]) == 2
     assert "expected a run of this configuration" in capsys.readouterr().err
+    training = out / "392" / "training.json"
+    facts = json.loads(training.read_text())
+    training.write_text(json.dumps({**facts, "warnings": ["Training was interrupted; the report"]}))
+    assert cli.main(command) == 2
+    assert "found one that was interrupted" in capsys.readouterr().err
+    (out / "392" / "report.html").unlink()
+    assert cli.main(command) == 2
+    assert "found a broken one; remove the folder" in capsys.readouterr().err
