@@ -46,6 +46,23 @@ class Demand:
     detail: tuple[float, ...]
 
 
+def as_asked(stored: Config, wanted: Config) -> Config:
+    """A run's configuration as it was asked for: without capacities that were measured.
+
+    Args:
+        stored: of a run folder.
+        wanted: what it is compared with; capacities that it names itself are kept.
+    """
+    if wanted.field.part_log2_size or wanted.field.part_finest:
+        return stored
+    field = dataclasses.replace(
+        stored.field,
+        part_log2_size=wanted.field.part_log2_size,
+        part_finest=wanted.field.part_finest,
+    )
+    return dataclasses.replace(stored, field=field)
+
+
 def allocated(
     config: Config, record: CaptureRecord, pictures: Pictures | None = None, cache: Cache = NO_CACHE
 ) -> tuple[Config, list[dict[str, Any]]]:

@@ -9,6 +9,7 @@ from typing import Any
 from monopart.geometry.errors import InputError
 
 from .atomic import write_json, write_text
+from .capacity import as_asked
 from .captures import SUBJECTS, Reading, read_capture, subject
 from .captures.subjects import ON_TRAINING_CAMERA
 from .choices import Extras
@@ -136,7 +137,8 @@ def _state(run: Path, config: Config) -> str:
     """How far a run is: absent, unfinished or done."""
     if not run.exists() or not any(run.iterdir()):
         return "absent"
-    if not (run / "config.json").is_file() or from_json(run / "config.json") != config:
+    path = run / "config.json"
+    if not path.is_file() or as_asked(from_json(path), config) != config:
         raise InputError(
             f"{run}: expected a run of this configuration or nothing, found another; choose "
             f"another --out, or remove that folder"

@@ -126,7 +126,7 @@ def test_forward_makes_no_modules(trained: Avatar) -> None:
 def test_training_lowers_the_loss_and_repeats_bit_for_bit(capture: Path) -> None:
     runs = []
     for _ in range(2):
-        avatar = make(capture, small(train={"iterations": 12, "ema": 0.0}))
+        avatar = make(capture, small(train={"iterations": 30, "ema": 0.0}))
         trainer = Trainer(avatar)
         first = trainer.step(0, 0.0)["mse"]
         trainer.loop()

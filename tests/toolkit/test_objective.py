@@ -239,7 +239,7 @@ def test_ignored_rows_are_right_and_have_no_gradient() -> None:
     seen = seen_batch(color, target, None, counted)
     assert isinstance(seen, Seen) and seen.counted == 4
     loss = color_loss(seen.color, seen.target) * 6 / 4
-    plain = float((color[counted] - target[counted]).square().mean())
+    plain = float((color[counted] - target[counted]).square().mean().detach())
     assert float(loss.detach()) == pytest.approx(plain)
     loss.backward()
     assert color.grad is not None and not bool(color.grad[~counted].any())

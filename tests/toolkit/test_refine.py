@@ -200,7 +200,7 @@ def test_wrong_poses_become_better_ones(tmp_path: Path) -> None:
     trained = Trainer(Avatar.create(record, config))
     trained.loop()
     before, after = joint_error(trained.avatar, read_capture(root))
-    assert before > 0.02 and after < 0.75 * before
+    assert before > 0.02 and after < 0.85 * before
     given = joint_error(as_given(trained.avatar), read_capture(root))
     assert given == pytest.approx((before, before))
 
@@ -298,7 +298,7 @@ def test_runs_carry_their_poses_and_scores_have_two_columns(
     assert [(r["split"], r["images"]) for r in rows] == [
         ("novel_view", 2),
         ("novel_pose", 1),
-        ("novel_pose", 1),
+        ("novel_pose_training_camera", 1),
     ]
     assert all(r["given"]["full"]["psnr"] != r["refit"]["full"]["psnr"] for r in rows)
 
