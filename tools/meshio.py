@@ -280,9 +280,30 @@ def losses(mesh: Mesh, path: str | os.PathLike[str]) -> tuple[str, ...]:
         rounded = mesh.verts.astype(np.float32).astype(np.float64)
     if kind.precision == "float32" and not np.array_equal(rounded, mesh.verts, equal_nan=True):
         lost.append("positions: rounded to float32")
+    lost += _special_losses(mesh, suffix)
     if suffix == ".stl":
         lost.append("vertices: merged where equal, unused ones dropped")
     return tuple(lost)
+
+
+def _special_losses(mesh: Mesh, suffix: str) -> list[str]:
+    """What a format holds only under a condition, or only in 8 bits."""
+    lost = []
+    if suffix in (".glb", ".gltf") and mesh.weights is not None and mesh.skeleton is None:
+        lost.append(f"weights: {suffix} holds them only with a skeleton")
+    if suffix in (".obj", ".glb", ".gltf") and mesh.texture is not None and mesh.corner_uv is None:
+        lost.append(f"texture: {suffix} holds it only with texture coordinates")
+    if suffix == ".ply" and mesh.colors is not None and not _is_8_bit(mesh.colors):
+        lost.append("colors: rounded to 8 bits")
+    if suffix not in (".ply", ".stl") and mesh.texture is not None and not _is_8_bit(mesh.texture):
+        lost.append("texture: rounded to 8 bits")
+    return lost
+
+
+def _is_8_bit(values: np.ndarray) -> bool:
+    """Whether values are whole numbers of 255ths from 0 to 1."""
+    scaled = values * 255
+    return bool(np.allclose(scaled, np.rint(np.clip(scaled, 0, 255)), rtol=0, atol=1e-9))
 
 
 def _room(kind: Format) -> "_Room":
