@@ -1,6 +1,8 @@
 """Meshes as npz in the layout of body files, so that `BodyModel.load` reads those with a skin."""
 
+import io
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -42,17 +44,22 @@ def read(path: Path) -> Mesh:
 
 
 def _arrays(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Arrays of an archive by their names, and the names of those that only a pickle could give."""
     arrays, skipped = {}, []
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not hasattr(archive, "files"):
-                raise InputError(f"{path}: expected an npz archive, found a single array")
-            for name in archive.files:
+        with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
+            for member in archive.namelist():
+                if not member.endswith(".npy"):
+                    continue
+                name = member.removesuffix(".npy")
+                content = io.BytesIO(archive.read(member))
                 try:
-                    arrays[name] = archive[name]
-                except ValueError:  # an object array would have to be unpickled
+                    arrays[name] = np.lib.format.read_array(content, allow_pickle=False)
+                except ValueError as error:
+                    if "allow_pickle" not in str(error):
+                        raise
                     skipped.append(name)
-    except (zipfile.BadZipFile, RuntimeError, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, SyntaxError) as error:
         raise InputError(
             f"{path}: expected a whole npz archive, found damage ({error}); export it again"
         ) from error

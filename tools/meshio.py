@@ -12,13 +12,15 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from monopart.geometry.atomic import replacing
 from monopart.geometry.errors import InputError
 
 WEIGHTS_SUM = 1e-3
 """Rows of weights may differ by this much from a sum of 1 before a writer refuses them."""
+
+_DAMAGE = (ValueError, KeyError, IndexError, TypeError, OverflowError, EOFError, MemoryError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,26 +54,27 @@ class Skeleton:
 class Mesh:
     """A triangle mesh with optional texture coordinates, skin, colours and texture.
 
-    Shapes and indices are checked; numbers may be NaN, for broken files are read to be reported.
+    Shapes and indices are checked here, with errors that name the array, so the fields say no shape
+    to the type checker; numbers may be NaN, for broken files are read to be reported.
 
     >>> flat = Mesh(np.eye(3), np.array([[0, 1, 2]]), name="triangle")
     >>> flat.num_verts, flat.num_faces, flat.weights is None
     (3, 1, True)
     """
 
-    verts: Float[np.ndarray, "V 3"]
+    verts: np.ndarray
     """Positions, float64, metres where the file says no other unit, (V, 3)."""
-    faces: Int[np.ndarray, "F 3"]
+    faces: np.ndarray
     """Vertex indices, int64, (F, 3); none for a point cloud."""
-    corner_uv: Float[np.ndarray, "F 3 2"] | None = None
+    corner_uv: np.ndarray | None = None
     """Texture coordinates per face corner, v upwards, (F, 3, 2)."""
-    weights: Float[np.ndarray, "V J"] | None = None
+    weights: np.ndarray | None = None
     """Skinning weights, (V, J)."""
     skeleton: Skeleton | None = None
     """Joints that the weights belong to."""
-    colors: Float[np.ndarray, "V 3"] | None = None
+    colors: np.ndarray | None = None
     """Vertex colours, sRGB in [0, 1], (V, 3)."""
-    texture: Float[np.ndarray, "H W 3"] | None = None
+    texture: np.ndarray | None = None
     """Image, sRGB in [0, 1], row 0 at v = 1, (H, W, 3)."""
     name: str = "mesh"
     """What to call it."""
@@ -84,10 +87,14 @@ class Mesh:
             value = getattr(self, field)
             if value is not None:
                 object.__setattr__(self, field, np.asarray(value, dtype=np.float64))
-        object.__setattr__(self, "faces", np.asarray(self.faces, dtype=np.int64).reshape(-1, 3))
+        faces = np.asarray(self.faces)
+        if faces.size == 0:  # a point cloud, whatever the shape of nothing
+            faces = np.zeros((0, 3), dtype=np.int64)
+        object.__setattr__(self, "faces", faces.astype(np.int64))
         verts, count = len(self.verts), len(self.faces)
         wanted = {
             "verts": (verts, 3),
+            "faces": (count, 3),
             "corner_uv": (count, 3, 2),
             "weights": (verts, None),
             "colors": (verts, 3),
@@ -230,7 +237,7 @@ def read_mesh(path: str | os.PathLike[str]) -> Mesh:
     if not source.is_file():
         found = "a folder" if source.is_dir() else "nothing"
         raise InputError(f"{source}: expected a mesh file, found {found}; check the path")
-    with refused(source):
+    with refused(source), np.errstate(all="ignore"):  # damaged numbers are looked at afterwards
         return _room(kind).read(source)
 
 
@@ -337,7 +344,7 @@ def refused(source: Path) -> Iterator[None]:
         if str(source) in text:
             raise
         raise InputError(f"{source}: {text}") from error
-    except (ValueError, KeyError, IndexError, TypeError, OverflowError, EOFError, OSError) as error:
+    except (*_DAMAGE, OSError) as error:
         raise InputError(
             f"{source}: expected a whole, valid {source.suffix} file, found damage "
             f"({type(error).__name__}: {error}); export it again"
