@@ -114,7 +114,8 @@ def clean(mesh: Mesh, close_holes: int = 0, progress: Progress = _silent) -> Rem
     finite, removed = without_broken(mesh)
     if not finite.num_faces:
         raise InputError(
-            f"{mesh.name}: expected triangles with finite corners, found none; nothing can be mended"
+            f"{mesh.name}: expected triangles with finite corners, found none; there is nothing "
+            "to mend"
         )
 
     def work(meshes: Any, size: float) -> None:

@@ -1,0 +1,164 @@
+"""The program ``monopart-mesh``: tools for meshes in standard files.
+
+Nothing heavy is imported here: help is there at once, and an extra that is missing is said.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from monopart.geometry.errors import InputError, MonopartError
+
+INSTALL = 'pip install "monopart[tools]"'
+BAD_INPUT = 2
+INTERRUPTED = 130
+FORMATS = "obj, ply, stl, glb, gltf, npz"
+
+Add = Callable[[argparse.ArgumentParser], None]
+
+PROGRAM = f"""Tools for meshes and bodies. Files: {FORMATS} (npz in the layout of SMPL files).
+
+Each command reads INPUT, which is never changed, and writes OUT, a picture (OUT.COMMAND.png) and a
+report (OUT.COMMAND.json). Results go to stdout, progress to stderr. Exit code: 0 done, 1 something
+was found or would be lost, 2 wrong input, 130 interrupt."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The arguments of the program."""
+    root = argparse.ArgumentParser(
+        prog="monopart-mesh",
+        description=PROGRAM,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = root.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, (text, add) in COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        add(command)
+    return root
+
+
+def _files(command: argparse.ArgumentParser, needs_out: bool = True) -> None:
+    """Where results go: the same for every command."""
+    group = command.add_argument_group("files")
+    text = f"result ({FORMATS})" if needs_out else "JSON report; without it nothing is written"
+    group.add_argument("-o", "--out", type=Path, required=needs_out, metavar="OUT", help=text)
+    if needs_out:
+        group.add_argument("--report", type=Path, metavar="FILE", help="JSON report")
+        group.add_argument("--text", action="store_true", help="ply and stl as text, not binary")
+    group.add_argument("--picture", type=Path, metavar="FILE", help="picture (png)")
+    group.add_argument("--no-picture", action="store_true", help="draw none")
+    group.add_argument(
+        "--overwrite", action="store_true", help="replace files that are there, never an input"
+    )
+
+
+def _input(command: argparse.ArgumentParser) -> None:
+    command.add_argument("input", type=Path, metavar="INPUT", help="mesh")
+
+
+def _convert(command: argparse.ArgumentParser) -> None:
+    _input(command)
+    command.add_argument(
+        "--strict",
+        action="store_true",
+        help="if anything would be lost, write nothing: code 1",
+    )
+    command.add_argument(
+        "--scale", type=float, default=1.0, metavar="S", help="factor of all lengths"
+    )
+    _files(command)
+
+
+def _remesh(command: argparse.ArgumentParser) -> None:
+    _input(command)
+    way = command.add_mutually_exclusive_group(required=True)
+    way.add_argument("--faces", type=int, metavar="N", help="decimate to N triangles")
+    way.add_argument("--edge", type=float, metavar="L", help="equal edges of about this length")
+    way.add_argument(
+        "--clean",
+        action="store_true",
+        help="remove NaN, doubles and slivers, mend non-manifold places",
+    )
+    command.add_argument(
+        "--close-holes", type=int, default=0, metavar="N", help="with --clean: of at most N edges"
+    )
+    _files(command)
+
+
+def _check(command: argparse.ArgumentParser) -> None:
+    _input(command)
+    command.add_argument("--strict", action="store_true", help="exit code 1 for warnings as well")
+    command.add_argument(
+        "--no-intersections", action="store_true", help="leave out self-intersections (slow)"
+    )
+    _files(command, needs_out=False)
+
+
+COMMANDS: dict[str, tuple[str, Add]] = {
+    "check": ("look for what makes a mesh unfit: holes, slivers, overlaps, weights", _check),
+    "remesh": ("new triangles for the same surface; weights and textures are kept", _remesh),
+    "convert": ("write a mesh in another format and say what that loses", _convert),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int | None:
+    """Run the program.
+
+    Args:
+        argv: arguments after the program's name; those of the process if None.
+
+    Returns:
+        Exit code: None or 0 when all is well, 1 when something was found, 2 for wrong input, 130
+        after an interrupt.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    arguments = parser().parse_args(argv)
+    try:
+        from .mesh_commands import run
+
+        return run(arguments)
+    except MonopartError as error:
+        return _fail(str(error))
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if not missing or missing == "monopart":
+            raise
+        return _fail(f"the package {missing} is not installed; install it by {INSTALL}")
+    except KeyboardInterrupt:
+        print("monopart-mesh: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except OSError as error:
+        return _fail(f"{error.filename or arguments.command}: {error.strerror or error}")
+    except MemoryError:
+        return _fail("expected a mesh that fits into memory, found a larger one; decimate it first")
+
+
+def _fail(message: str) -> int:
+    print(f"monopart-mesh: error: {' '.join(message.split())}", file=sys.stderr)
+    return BAD_INPUT
+
+
+def checked_scale(value: float) -> float:
+    """A factor above 0.
+
+    Args:
+        value: what the user gave.
+
+    Returns:
+        The same.
+
+    Raises:
+        InputError: not a positive finite number.
+
+    >>> checked_scale(0.01)
+    0.01
+    """
+    if not 0 < value < float("inf"):
+        raise InputError(f"--scale: expected a number above 0, found {value:g}; give another")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

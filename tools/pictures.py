@@ -1,0 +1,385 @@
+"""Pictures of meshes: front and back, coloured or textured, and the layout of their UVs."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from .meshio import Mesh
+from .raster import Raster, rasterise
+
+SIZE = 640
+"""Pixels along the side of one panel."""
+_FINE = 2  # samples along the side of a pixel
+_PAPER = np.array([1.0, 1.0, 1.0])
+_PLAIN = np.array([0.72, 0.74, 0.78])
+_LIGHT = np.array([0.35, 0.55, 0.76])
+_HEAT = np.array(
+    [
+        [0.19, 0.25, 0.55],
+        [0.25, 0.55, 0.75],
+        [0.75, 0.85, 0.65],
+        [0.95, 0.65, 0.25],
+        [0.7, 0.1, 0.1],
+    ]
+)
+_PARTS = np.array(
+    [
+        *([0.90, 0.62, 0.00], [0.34, 0.71, 0.91], [0.00, 0.62, 0.45], [0.94, 0.89, 0.26]),
+        *([0.00, 0.45, 0.70], [0.84, 0.37, 0.00], [0.80, 0.47, 0.65], [0.55, 0.34, 0.29]),
+        *([0.60, 0.60, 0.60], [0.45, 0.80, 0.45], [0.55, 0.45, 0.80], [0.80, 0.20, 0.35]),
+    ]
+)  # the first seven: Okabe and Ito, told apart by people who see few colours
+Image = np.ndarray
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture of several, with what is written above it."""
+
+    title: str
+    image: Image
+
+
+def part_color(part: Int[np.ndarray, "*b"]) -> Float[np.ndarray, "*b 3"]:
+    """Colours of parts, sRGB; they repeat after twelve, negative numbers are grey.
+
+    Args:
+        part: part numbers.
+
+    Returns:
+        Colours in [0, 1].
+
+    >>> part_color(np.array([0, -1])).tolist()
+    [[0.9, 0.62, 0.0], [0.72, 0.74, 0.78]]
+    """
+    part = np.asarray(part)
+    return np.where((part < 0)[..., None], _PLAIN, _PARTS[part % len(_PARTS)])
+
+
+def heat_color(
+    values: Float[np.ndarray, "*b"], low: float, high: float
+) -> Float[np.ndarray, "*b 3"]:
+    """Colours from blue (`low`) over green to red (`high` and above); NaN is grey.
+
+    Args:
+        values: numbers.
+        low: the bluest.
+        high: the reddest.
+
+    Returns:
+        Colours in [0, 1].
+    """
+    known = np.isfinite(values)
+    place = np.clip((np.where(known, values, low) - low) / max(high - low, 1e-12), 0, 1)
+    place = place * (len(_HEAT) - 1)
+    start = np.minimum(place.astype(np.int64), len(_HEAT) - 2)
+    part = (place - start)[..., None]
+    colors = _HEAT[start] * (1 - part) + _HEAT[start + 1] * part
+    return np.where(known[..., None], colors, _PLAIN)
+
+
+def checker_color(uv: Float[np.ndarray, "*b 2"], squares: int = 48) -> Float[np.ndarray, "*b 3"]:
+    """A checker board in the unit square, tinted so that places can be told apart.
+
+    Args:
+        uv: texture coordinates.
+        squares: along each side.
+
+    Returns:
+        Colours in [0, 1].
+    """
+    uv = np.nan_to_num(uv)
+    cell = np.floor(uv * squares)
+    odd = (cell.sum(axis=-1) % 2)[..., None]
+    tint = np.stack([uv[..., 0] % 1, uv[..., 1] % 1, 1 - uv[..., 0] % 1], axis=-1)
+    return 0.35 + 0.4 * odd + 0.25 * tint
+
+
+def texture_color(
+    texture: Float[np.ndarray, "H W 3"], uv: Float[np.ndarray, "*b 2"]
+) -> Float[np.ndarray, "*b 3"]:
+    """Nearest texel, repeated beyond the unit square.
+
+    Args:
+        texture: row 0 at v = 1.
+        uv: texture coordinates.
+
+    Returns:
+        Colours.
+    """
+    height, width = texture.shape[:2]
+    uv = np.nan_to_num(uv) % 1
+    column = np.minimum((uv[..., 0] * width).astype(np.int64), width - 1)
+    row = np.minimum(((1 - uv[..., 1]) * height).astype(np.int64), height - 1)
+    return texture[np.clip(row, 0, height - 1), column]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A mesh seen from the front and from the back, ready to be coloured."""
+
+    rasters: tuple[Raster, Raster]
+    shade: tuple[Image, Image]
+
+    def colored(self, corner_color: Float[np.ndarray, "F 3 3"]) -> Image:
+        """Both sides with colours of the face corners."""
+        return self._joined([r.of_corners(corner_color) for r in self.rasters])
+
+    def by_uv(
+        self, corner_uv: Float[np.ndarray, "F 3 2"], texture: Float[np.ndarray, "H W 3"] | None
+    ) -> Image:
+        """Both sides with a texture, or with the checker board."""
+        uvs = [r.of_corners(corner_uv) for r in self.rasters]
+        if texture is None:
+            return self._joined([checker_color(uv) for uv in uvs])
+        return self._joined([texture_color(texture, uv) for uv in uvs])
+
+    def _joined(self, colors: Sequence[Image]) -> Image:
+        sides = []
+        for raster, shade, color in zip(self.rasters, self.shade, colors, strict=True):
+            shown = np.where((raster.face >= 0)[..., None], color * shade[..., None], _PAPER)
+            sides.append(_smaller(shown))
+        return np.concatenate(sides, axis=1)
+
+
+def view(mesh: Mesh, size: int = SIZE) -> View:
+    """Look at a mesh along z from both sides, y up, scaled to fill the picture.
+
+    Args:
+        mesh: the mesh; what is not finite is not seen.
+        size: width of the picture in pixels; each side takes half of it, and a flat mesh is given
+            less height.
+
+    Returns:
+        The two sides.
+    """
+    verts = _unit(mesh.verts)
+    height, width = size * _FINE, size * _FINE // 2
+    tall, wide = max(_extent(verts, 1), 1e-9), max(_extent(verts, 0), 1e-9)
+    scale = 0.94 * min(height / tall, width / wide)
+    height = min(height, int(tall * scale * 1.06) // _FINE * _FINE + 40 * _FINE)
+    rasters, shades = [], []
+    for side in (1.0, -1.0):
+        x = width / 2 + side * scale * verts[:, 0]
+        y = height / 2 - scale * verts[:, 1]
+        corners = np.stack([x, y], axis=1)[mesh.faces]
+        raster = rasterise(corners, (-side * verts[:, 2])[mesh.faces], height, width)
+        rasters.append(raster)
+        shades.append(_shade(verts, mesh.faces, raster, side))
+    return View((rasters[0], rasters[1]), (shades[0], shades[1]))
+
+
+def _unit(verts: np.ndarray) -> np.ndarray:
+    """Moved to the middle and scaled to about 1; not finite stays not finite."""
+    finite = verts[np.isfinite(verts).all(axis=1)]
+    if not len(finite):
+        return np.full_like(verts, np.nan)
+    with np.errstate(over="ignore", invalid="ignore"):
+        low, high = finite.min(axis=0), finite.max(axis=0)
+        size = max(float((high / 2 - low / 2).max()), 1e-300)
+        return (verts / size - (high / 2 + low / 2) / size) / 2
+
+
+def _extent(verts: np.ndarray, axis: int) -> float:
+    values = verts[np.isfinite(verts).all(axis=1), axis]
+    return float(np.ptp(values)) if len(values) else 1.0
+
+
+def _shade(verts: np.ndarray, faces: np.ndarray, raster: Raster, side: float) -> Image:
+    with np.errstate(invalid="ignore"):
+        a, b, c = (verts[faces[:, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = np.nan_to_num(normal / np.where(length > 0, length, 1))
+    light = np.abs(normal @ (_LIGHT * np.array([side, 1, side])))
+    out = np.ones(raster.face.shape)
+    seen = raster.face >= 0
+    out[seen] = 0.5 + 0.5 * np.minimum(light[raster.face[seen]], 1)
+    return out
+
+
+def _smaller(image: Image) -> Image:
+    height, width = (n // _FINE for n in image.shape[:2])
+    return (
+        image[: height * _FINE, : width * _FINE]
+        .reshape(height, _FINE, width, _FINE, 3)
+        .mean(axis=(1, 3))
+    )
+
+
+def face_distortion(mesh: Mesh) -> Float[np.ndarray, "F"]:
+    """Symmetric Dirichlet energy of each face, 4 where nothing is stretched; areas add up to 1.
+
+    Args:
+        mesh: with texture coordinates.
+
+    Returns:
+        s₁² + s₂² + 1/s₁² + 1/s₂² of the singular values of the map from the surface, scaled as a
+        whole so that both areas agree; infinite where a face has no area or is flipped, NaN where
+        the mesh has none.
+
+    Reference:
+        Smith and Schaefer 2015, equation 3.
+    """
+    if mesh.corner_uv is None or not mesh.num_faces:
+        return np.zeros(0)
+    with np.errstate(all="ignore"):
+        corners = _unit(mesh.verts)[mesh.faces]
+        e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        x1 = np.linalg.norm(e1, axis=1)
+        x2 = (e1 * e2).sum(axis=1) / x1
+        y2 = np.linalg.norm(np.cross(e1, e2), axis=1) / x1
+        u1, u2 = (mesh.corner_uv[:, k] - mesh.corner_uv[:, 0] for k in (1, 2))
+        du = u1 / x1[:, None]
+        dv = (u2 - du * x2[:, None]) / y2[:, None]
+        area = x1 * y2
+        det = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]
+        good = np.isfinite(det) & (area > 0)
+        scale = (np.abs(det) * area)[good].sum() / area[good].sum()
+        square = (du**2).sum(axis=1) + (dv**2).sum(axis=1)
+        energy = square / scale + square * scale / det**2
+        return np.where(good, np.where(det > 0, energy, np.inf), np.nan)
+
+
+def uv_panels(mesh: Mesh, size: int = SIZE) -> list[Panel]:
+    """Layout with checker board and distortion, each also on the surface.
+
+    Args:
+        mesh: with texture coordinates.
+        size: of each panel in pixels.
+
+    Returns:
+        Four panels: layout, its distortion, surface, its distortion.
+    """
+    if mesh.corner_uv is None:
+        return []
+    raster = _uv_raster(mesh.corner_uv, size)
+    energy = face_distortion(mesh)
+    heat = np.repeat(heat_color(energy, 4.0, 5.0)[:, None], 3, axis=1)
+    seen = view(mesh, size)
+    return [
+        Panel("UV layout", _layout(raster, checker_color(raster.of_corners(mesh.corner_uv)), mesh)),
+        Panel(
+            "distortion (symmetric Dirichlet, blue 4, red 5 and above)",
+            _layout(raster, raster.of_corners(heat), mesh),
+        ),
+        Panel("front and back", seen.by_uv(mesh.corner_uv, None)),
+        Panel("distortion on the surface", seen.colored(heat)),
+    ]
+
+
+def _uv_raster(corner_uv: np.ndarray, size: int) -> Raster:
+    """The unit square, or all of the layout where it is larger."""
+    finite = corner_uv[np.isfinite(corner_uv).all(axis=(1, 2))].reshape(-1, 2)
+    low = np.minimum(finite.min(axis=0, initial=0.0), 0.0)
+    span = max(float((np.maximum(finite.max(axis=0, initial=1.0), 1.0) - low).max()), 1e-9)
+    corners = (corner_uv - low) / span
+    corners = np.stack([corners[..., 0], 1 - corners[..., 1]], axis=-1) * (size * _FINE)
+    return rasterise(corners, np.zeros(corners.shape[:2]), size * _FINE, size * _FINE)
+
+
+def _layout(raster: Raster, color: Image, mesh: Mesh) -> Image:
+    """Charts on grey paper, with a dark line around each."""
+    from .transfer import uv_charts
+
+    label = np.full(raster.face.shape, -1, dtype=np.int64)
+    inside = raster.face >= 0
+    if mesh.corner_uv is not None:
+        label[inside] = uv_charts(mesh.faces, mesh.corner_uv)[raster.face[inside]]
+    border = np.zeros(label.shape, dtype=bool)
+    border[1:] |= label[1:] != label[:-1]
+    border[:, 1:] |= label[:, 1:] != label[:, :-1]
+    shown = np.where(inside[..., None], color, 0.93)
+    return _smaller(np.where(border[..., None], 0.15, shown))
+
+
+def part_panels(
+    mesh: Mesh, face_part: Int[np.ndarray, "F"], names: Sequence[str], size: int = SIZE
+) -> list[Panel]:
+    """Parts in their colours, front and back.
+
+    Args:
+        mesh: the mesh.
+        face_part: part of each face.
+        names: of the parts.
+        size: of the panel in pixels.
+
+    Returns:
+        One panel.
+    """
+    color = np.repeat(part_color(face_part)[:, None], 3, axis=1)
+    return [Panel(", ".join(names), view(mesh, size).colored(color))]
+
+
+def surface_panels(mesh: Mesh, title: str, size: int = SIZE) -> list[Panel]:
+    """The mesh as it is: with its texture, its colours, the joints that move it, or plain.
+
+    Args:
+        mesh: the mesh.
+        title: what to write above it.
+        size: of the panel in pixels.
+
+    Returns:
+        One panel; a point cloud is drawn as small crosses.
+    """
+    if not mesh.num_faces:
+        mesh = _crosses(mesh)
+    seen = view(mesh, size)
+    if mesh.texture is not None and mesh.corner_uv is not None:
+        return [Panel(title, seen.by_uv(mesh.corner_uv, mesh.texture))]
+    if mesh.colors is not None:
+        return [Panel(title, seen.colored(mesh.colors[mesh.faces]))]
+    if mesh.weights is not None and mesh.weights.shape[1]:
+        mixed = np.nan_to_num(mesh.weights) @ part_color(np.arange(mesh.weights.shape[1]))
+        return [Panel(title, seen.colored(np.clip(mixed, 0, 1)[mesh.faces]))]
+    return [Panel(title, seen.colored(np.broadcast_to(_PLAIN, (mesh.num_faces, 3, 3))))]
+
+
+def _crosses(mesh: Mesh) -> Mesh:
+    """A small triangle at each point, for a picture."""
+    verts = _unit(mesh.verts)
+    corners = np.array([[-1.0, -0.6, 0], [1, -0.6, 0], [0, 1, 0]]) * 0.004
+    every = (verts[:, None] + corners).reshape(-1, 3)
+    colors = None if mesh.colors is None else np.repeat(mesh.colors, 3, axis=0)
+    return dataclasses.replace(
+        mesh,
+        verts=every,
+        faces=np.arange(len(every)).reshape(-1, 3),
+        corner_uv=None,
+        weights=None,
+        skeleton=None,
+        colors=colors,
+    )
+
+
+def sheet(panels: Sequence[Panel]) -> Image:
+    """Panels side by side, two in a row, each below its title.
+
+    Args:
+        panels: at least one.
+
+    Returns:
+        One picture.
+    """
+    from PIL import Image as Pillow
+    from PIL import ImageDraw
+
+    rows = [panels[n : n + 2] for n in range(0, len(panels), 2)]
+    band, gap = 22, 8
+    width = max(sum(p.image.shape[1] + gap for p in row) for row in rows) + gap
+    height = sum(max(p.image.shape[0] for p in row) + band + gap for row in rows) + gap
+    paper = Pillow.new("RGB", (width, height), "white")
+    pen = ImageDraw.Draw(paper)
+    top = gap
+    for row in rows:
+        left = gap
+        for panel in row:
+            pen.text((left, top + 4), panel.title, fill=(40, 40, 40))
+            pixels = np.rint(np.clip(panel.image, 0, 1) * 255).astype(np.uint8)
+            paper.paste(Pillow.fromarray(pixels), (left, top + band))
+            left += panel.image.shape[1] + gap
+        top += max(p.image.shape[0] for p in row) + band + gap
+    return np.asarray(paper).astype(np.float64) / 255
