@@ -49,7 +49,7 @@ def convert(arguments: argparse.Namespace, job: Job) -> int:
             print(f"  would be lost: {line}")
         print("nothing written (--strict)", file=sys.stderr)
         return FOUND
-    from .pictures import surface_panels
+    from .views import surface_panels
 
     return job.finish(mesh, {"scale": scale}, lambda: surface_panels(mesh, mesh.name))
 
@@ -89,7 +89,7 @@ def remesh(arguments: argparse.Namespace, job: Job) -> int:
         Exit code.
     """
     from . import remesh as room
-    from .pictures import surface_panels
+    from .views import surface_panels
 
     mesh = job.read(arguments.input)
     if arguments.faces is not None:

@@ -14,7 +14,7 @@ from .meshio import Mesh, format_of, read_mesh, write_mesh
 from .progress import Update
 
 if TYPE_CHECKING:
-    from .pictures import Panel
+    from .views import Panel
 
 FOUND = 1
 """Exit code when the command ran and found something wrong."""
@@ -193,7 +193,7 @@ class Job:
 
     def _write_picture(self, path: Path, panels: "list[Panel]") -> None:
         from .images import encoded
-        from .pictures import sheet
+        from .views import sheet
 
         write_bytes(path, encoded(sheet(panels)))
 

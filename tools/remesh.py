@@ -177,8 +177,9 @@ def _remeshed(
     import pymeshlab
 
     progress(0.05, "remeshing")
-    # in a box of diagonal 1: some limits of PyMeshLab are absolute, and some of it is float32
-    low, size = _box(mesh)
+    # in a box of about 1: some limits of PyMeshLab are absolute, and some of it is float32
+    low, diagonal = _box(mesh)
+    size = 2.0 ** np.ceil(np.log2(diagonal))  # a power of two changes no digit
     meshes = pymeshlab.MeshSet(verbose=False)
     try:
         meshes.add_mesh(pymeshlab.Mesh((mesh.verts - low) / size, mesh.faces))
@@ -199,7 +200,7 @@ def _remeshed(
     progress(0.6, "attributes")
     new = transferred(verts, faces, mesh)
     progress(0.8, "distance")
-    return Remeshed(new, _report(mesh, new, method, size))
+    return Remeshed(new, _report(mesh, new, method, diagonal))
 
 
 def _box(mesh: Mesh) -> tuple[Float[np.ndarray, "3"], float]:

@@ -7,6 +7,9 @@ from jaxtyping import Float, Int
 
 from .meshio import Mesh
 
+_INWARDS = 1e-3  # of the way from a corner of a face to its middle
+_BEYOND = 8.0  # barycentric coordinates beyond which the map of a face is not continued
+
 
 @dataclass(frozen=True, eq=False)
 class Closest:
@@ -54,6 +57,12 @@ def closest_on(
 
 def _bary(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Barycentric coordinates of points in their triangles; needles give those of their ends."""
+    bary = np.clip(_plane_bary(points, corners), 0, 1)
+    return bary / bary.sum(axis=1, keepdims=True)
+
+
+def _plane_bary(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates in the planes of triangles, negative outside of them."""
     ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(ab, ac)
     square = (normal * normal).sum(axis=1)
@@ -64,9 +73,7 @@ def _bary(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     bary = np.stack([1 - v - w, v, w], axis=1)
     away = np.linalg.norm(corners - points[:, None], axis=2)
     nearest = np.eye(3)[away.argmin(axis=1)]
-    bary = np.where((square > 0)[:, None], bary, nearest)
-    bary = np.clip(bary, 0, 1)
-    return bary / bary.sum(axis=1, keepdims=True)
+    return np.where((square > 0)[:, None], bary, nearest)
 
 
 def transferred(
@@ -112,17 +119,36 @@ def _corner_uv(verts: np.ndarray, faces: np.ndarray, source: Mesh) -> np.ndarray
     if source.corner_uv is None or not source.num_faces:
         return None
     chart = uv_charts(source.faces, source.corner_uv)
-    middles = verts[faces].mean(axis=1)
-    chosen = chart[closest_on(middles, source.verts, source.faces).face]
-    uv = np.zeros((len(faces), 3, 2))
+    corners = verts[faces]
+    middles = corners.mean(axis=1)
+    middle_face = closest_on(middles, source.verts, source.faces).face
+    # looked for a little inside of the face, so that a corner on a seam finds the right side of it
+    inner = corners + _INWARDS * (middles[:, None] - corners)
+    found = np.zeros(faces.shape, dtype=np.int64)
+    chosen = chart[middle_face]
     for label in np.unique(chosen).tolist():
         rows = np.flatnonzero(chosen == label)
         among = np.flatnonzero(chart == label)
-        corners = verts[faces[rows]].reshape(-1, 3)
-        hit = closest_on(corners, source.verts, source.faces[among])
-        values = source.corner_uv[among[hit.face]]
-        uv[rows] = (values * hit.bary[..., None]).sum(axis=1).reshape(-1, 3, 2)
-    return uv
+        hit = closest_on(inner[rows].reshape(-1, 3), source.verts, source.faces[among])
+        found[rows] = among[hit.face].reshape(-1, 3)
+    uv = _uv_at(corners, found, source)
+    # a face that runs over a seam between two sides of one chart goes on as its middle does
+    expected = _uv_at(corners, np.repeat(middle_face[:, None], 3, axis=1), source)
+    middle = _uv_at(middles[:, None], middle_face[:, None], source)
+    reach = np.linalg.norm(expected - middle, axis=2).max(axis=1)
+    over = np.linalg.norm(uv - expected, axis=2).max(axis=1) > 2 * reach
+    return np.where(over[:, None, None], expected, uv)
+
+
+def _uv_at(points: np.ndarray, face: np.ndarray, source: Mesh) -> np.ndarray:
+    """UVs (n, k, 2) of points (n, k, 3) by the maps of source faces (n, k), also beside them."""
+    flat = face.reshape(-1)
+    where, corners = points.reshape(-1, 3), source.verts[source.faces[flat]]
+    bary = _plane_bary(where, corners)
+    far = np.abs(bary).max(axis=1) > _BEYOND
+    bary[far] = _bary(where[far], corners[far])
+    values = source.corner_uv[flat] if source.corner_uv is not None else np.zeros((len(flat), 3, 2))
+    return (values * bary[..., None]).sum(axis=1).reshape(*face.shape, 2)
 
 
 def uv_charts(
