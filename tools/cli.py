@@ -48,6 +48,7 @@ def _files(command: argparse.ArgumentParser, needs_out: bool = True) -> None:
         group.add_argument("--report", type=Path, metavar="FILE", help="JSON report")
         group.add_argument("--text", action="store_true", help="ply and stl as text, not binary")
     group.add_argument("--picture", type=Path, metavar="FILE", help="picture (png)")
+    group.add_argument("--picture-size", type=int, default=640, metavar="N", help="pixels a panel")
     group.add_argument("--no-picture", action="store_true", help="draw none")
     group.add_argument(
         "--overwrite", action="store_true", help="replace files that are there, never an input"

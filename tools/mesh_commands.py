@@ -26,8 +26,11 @@ def run(arguments: argparse.Namespace) -> int:
     names = {f.name for f in dataclasses.fields(Options)}
     options = Options(**{k: v for k, v in vars(arguments).items() if k in names})
     if command == "check":  # its result is the report
-        options = dataclasses.replace(options, report=options.out)
-    with progress_bar(command) as update:
+        out = options.out
+        picture = options.picture or (out and out.with_suffix(".png"))
+        options = dataclasses.replace(options, out=None, report=out, picture=picture)
+    # broken meshes hold NaN and infinity; they are reported, not warned of
+    with progress_bar(command) as update, np.errstate(all="ignore"):
         return COMMANDS[command](arguments, Job(command, options, update))
 
 
@@ -51,7 +54,7 @@ def convert(arguments: argparse.Namespace, job: Job) -> int:
         return FOUND
     from .views import surface_panels
 
-    return job.finish(mesh, {"scale": scale}, lambda: surface_panels(mesh, mesh.name))
+    return job.finish(mesh, {"scale": scale}, lambda size: surface_panels(mesh, mesh.name, size))
 
 
 def scaled(mesh: Mesh, factor: float) -> Mesh:
@@ -103,11 +106,39 @@ def remesh(arguments: argparse.Namespace, job: Job) -> int:
     return job.finish(
         done.mesh,
         done.report,
-        lambda: [*surface_panels(mesh, "before"), *surface_panels(done.mesh, "after")],
+        lambda size: [
+            *surface_panels(mesh, "before", size),
+            *surface_panels(done.mesh, "after", size),
+        ],
     )
 
 
+def check(arguments: argparse.Namespace, job: Job) -> int:
+    """Look for faults and print them, the worst first.
+
+    Args:
+        arguments: `input`, `strict`, `no_intersections`.
+        job: the run.
+
+    Returns:
+        Exit code; 1 when there is an error, with `strict` also for a warning.
+    """
+    from .check import check_mesh
+    from .views import fault_panels
+
+    mesh = job.read(arguments.input)
+    job.update(0.1, "checking")
+    report = check_mesh(mesh, intersections=not arguments.no_intersections)
+    for line in report.lines():
+        print(line)
+    warned = any(f.count and f.severity == "warning" for f in report.findings)
+    ok = report.ok and not (arguments.strict and warned)
+    bad = [(f.of, o.indices) for f in report.findings if f.severity != "note" for o in f.worst]
+    return job.finish(None, report.as_dict(), lambda size: fault_panels(mesh, bad, size), ok)
+
+
 COMMANDS: dict[str, Callable[[argparse.Namespace, Job], int]] = {
+    "check": check,
     "convert": convert,
     "remesh": remesh,
 }

@@ -39,6 +39,8 @@ class Options:
     """Where the picture goes; beside `out` if None."""
     no_picture: bool = False
     """Draw none."""
+    picture_size: int = 640
+    """Pixels along the side of a panel of the picture."""
     overwrite: bool = False
     """Files that are there may be replaced, but never an input."""
     text: bool = False
@@ -84,7 +86,12 @@ class Job:
             InputError: a result would replace a file that must stay.
         """
         self.inputs.append(path)
-        if self.options.out is not None and self.command != "check":
+        if not 16 <= self.options.picture_size <= 4096:
+            raise InputError(
+                "--picture-size: expected from 16 to 4096 pixels, found "
+                f"{self.options.picture_size}; choose another"
+            )
+        if self.options.out is not None:
             format_of(self.options.out)
         self.guard([p for p in (self.options.out, self.report(), self.picture()) if p])
 
@@ -138,7 +145,7 @@ class Job:
         self,
         mesh: Mesh | None,
         result: dict[str, Any],
-        panels: Callable[[], "list[Panel]"],
+        panels: Callable[[int], "list[Panel]"],
         ok: bool = True,
     ) -> int:
         """Write mesh, picture and report, and say what was written.
@@ -146,7 +153,7 @@ class Job:
         Args:
             mesh: what goes into `out`; None writes no mesh.
             result: what the command found, for the report.
-            panels: draws the picture.
+            panels: draws the picture, given the pixels along the side of a panel.
             ok: nothing wrong was found.
 
         Returns:
@@ -164,7 +171,7 @@ class Job:
         picture = self.picture()
         if picture is not None:
             self.update(0.92, "drawing")
-            self._write_picture(picture, panels())
+            self._write_picture(picture, panels(self.options.picture_size))
             written.append(picture)
         report = self.report()
         if report is not None:

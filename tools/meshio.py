@@ -20,7 +20,10 @@ from monopart.geometry.errors import InputError
 WEIGHTS_SUM = 1e-3
 """Rows of weights may differ by this much from a sum of 1 before a writer refuses them."""
 
-_DAMAGE = (ValueError, KeyError, IndexError, TypeError, OverflowError, EOFError, MemoryError)
+_DAMAGE = (
+    *(ValueError, KeyError, IndexError, TypeError, OverflowError, EOFError, MemoryError),
+    *(RecursionError, AttributeError),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,7 +313,7 @@ def _special_losses(mesh: Mesh, suffix: str) -> list[str]:
 def _is_8_bit(values: np.ndarray) -> bool:
     """Whether values are whole numbers of 255ths from 0 to 1."""
     scaled = values * 255
-    return bool(np.allclose(scaled, np.rint(np.clip(scaled, 0, 255)), rtol=0, atol=1e-9))
+    return bool(np.allclose(scaled, np.rint(np.clip(scaled, 0, 255)), rtol=0, atol=1e-3))
 
 
 def _room(kind: Format) -> "_Room":

@@ -10,11 +10,10 @@ from jaxtyping import Float, Int
 from .meshio import Mesh
 from .raster import Raster, rasterise
 
-SIZE = 640
-"""Pixels along the side of one panel."""
 _FINE = 2  # samples along the side of a pixel
 _PAPER = np.array([1.0, 1.0, 1.0])
 _PLAIN = np.array([0.72, 0.74, 0.78])
+_FAULT = np.array([0.86, 0.10, 0.12])
 _LIGHT = np.array([0.35, 0.55, 0.76])
 _HEAT = np.array(
     [
@@ -145,7 +144,7 @@ class View:
         return np.concatenate(sides, axis=1)
 
 
-def view(mesh: Mesh, size: int = SIZE) -> View:
+def view(mesh: Mesh, size: int = 640) -> View:
     """Look at a mesh along z from both sides, y up, scaled to fill the picture.
 
     Args:
@@ -244,7 +243,7 @@ def face_distortion(mesh: Mesh) -> Float[np.ndarray, "F"]:
         return np.where(good, np.where(det > 0, energy, np.inf), np.nan)
 
 
-def uv_panels(mesh: Mesh, size: int = SIZE) -> list[Panel]:
+def uv_panels(mesh: Mesh, size: int = 640) -> list[Panel]:
     """Layout with checker board and distortion, each also on the surface.
 
     Args:
@@ -297,7 +296,7 @@ def _layout(raster: Raster, color: Image, mesh: Mesh) -> Image:
 
 
 def part_panels(
-    mesh: Mesh, face_part: Int[np.ndarray, "F"], names: Sequence[str], size: int = SIZE
+    mesh: Mesh, face_part: Int[np.ndarray, "F"], names: Sequence[str], size: int = 640
 ) -> list[Panel]:
     """Parts in their colours, front and back.
 
@@ -314,7 +313,37 @@ def part_panels(
     return [Panel(", ".join(names), view(mesh, size).colored(color))]
 
 
-def surface_panels(mesh: Mesh, title: str, size: int = SIZE) -> list[Panel]:
+def fault_panels(
+    mesh: Mesh, faults: Sequence[tuple[str, Sequence[int]]], size: int = 640
+) -> list[Panel]:
+    """The mesh in grey, the places of faults in red.
+
+    Args:
+        mesh: the mesh; one of points alone is drawn as it is.
+        faults: what is counted ("faces", "pairs of faces", "vertices", "edges") and its numbers.
+        size: of the panel in pixels.
+
+    Returns:
+        One panel.
+    """
+    if not mesh.num_faces:
+        return surface_panels(mesh, "points", size)
+    bad = np.zeros(mesh.num_faces, dtype=bool)
+    verts = np.zeros(mesh.num_verts, dtype=bool)
+    for of, indices in faults:
+        chosen = np.asarray(indices, dtype=np.int64)
+        if "face" in of:
+            bad[chosen[chosen < mesh.num_faces]] = True
+        elif "vert" in of or "edge" in of:
+            verts[chosen[chosen < mesh.num_verts]] = True
+    bad |= verts[mesh.faces].any(axis=1)
+    color = np.where(bad[:, None], _FAULT, _PLAIN)
+    title = "faults (red, the worst of each kind)" if bad.any() else "no fault to be seen"
+    corner_color = np.repeat(color[:, None], 3, axis=1)
+    return [Panel(title, view(mesh, size).colored(corner_color))]
+
+
+def surface_panels(mesh: Mesh, title: str, size: int = 640) -> list[Panel]:
     """The mesh as it is: with its texture, its colours, the joints that move it, or plain.
 
     Args:
