@@ -60,10 +60,10 @@ def closest_faces(
 def barycentrics(
     points: Float[np.ndarray, "n 3"], triangles: Float[np.ndarray, "n 3 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Barycentric coordinates of points of triangles; of its longer edge at the first corner, if flat.
+    """Barycentric coordinates of points of triangles, flat ones included.
 
     Args:
-        points: points in the planes of the triangles.
+        points: points on the triangles, up to rounding.
         triangles: corners.
 
     Returns:
@@ -74,19 +74,27 @@ def barycentrics(
     """
     a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     w = points - a
-    uu, vv = (u * u).sum(1), (v * v).sum(1)
+    uu = (u * u).sum(1)
     long = np.where(uu > 0, uu, 1.0)
     lean, along = (u * v).sum(1) / long, (u * w).sum(1) / long
     height = v - lean[:, None] * u  # the part of v across u: determinants would cancel to nothing
     square = (height * height).sum(1)
-    thin = ~(square > (8 * np.finfo(float).eps) ** 2 * vv) | (uu == 0)
-    by_v = (height * (w - along[:, None] * u)).sum(1) / np.where(thin, 1.0, square)
+    by_v = (height * (w - along[:, None] * u)).sum(1) / np.where(square > 0, square, 1.0)
     by_u = along - by_v * lean
-    beside = np.where(vv > 0, (v * w).sum(1) / np.where(vv > 0, vv, 1.0), 0.0)
-    by_u = np.where(thin, np.where(uu >= vv, along * (uu > 0), 0.0), by_u)
-    by_v = np.where(thin, np.where(uu >= vv, 0.0, beside), by_v)
-    bary = np.clip(np.stack([1 - by_u - by_v, by_u, by_v], 1), 0.0, None)
-    return bary / bary.sum(1, keepdims=True)
+    inside = np.clip(np.stack([1 - by_u - by_v, by_u, by_v], 1), 0.0, None)
+    tries = [inside / inside.sum(1, keepdims=True)]
+    for k in range(3):  # of a needle the coordinates are rounding: then an edge is nearer
+        start, edge = triangles[:, k], triangles[:, (k + 1) % 3] - triangles[:, k]
+        length = (edge * edge).sum(1)
+        share = ((points - start) * edge).sum(1) / np.where(length > 0, length, 1.0)
+        on_edge = np.zeros((len(points), 3))
+        on_edge[:, (k + 1) % 3] = np.clip(share, 0.0, 1.0)
+        on_edge[:, k] = 1 - on_edge[:, (k + 1) % 3]
+        tries.append(on_edge)
+    every = np.stack(tries, 1)
+    gap = np.linalg.norm(every @ triangles - points[:, None], axis=2)
+    gap[:, 0] = np.nan_to_num(gap[:, 0], nan=np.inf)
+    return every[np.arange(len(points)), gap.argmin(1)]
 
 
 def corner_normals(
@@ -113,7 +121,7 @@ def corner_normals(
 
 
 def transfer_rows(
-    rows: Float[np.ndarray, "s k"],
+    rows: Float[np.ndarray, "r k"],
     source: tuple[Float[np.ndarray, "s 3"], Int[np.ndarray, "g 3"]],
     target: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]],
     max_distance: float = math.inf,

@@ -42,10 +42,22 @@ def part_colors(count: int) -> Float[np.ndarray, "n 3"]:
     return np.array([*_COLORS, *more], float)[:count].reshape(-1, 3)
 
 
-def _covered(
-    screen: np.ndarray, depth: np.ndarray, size: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Face seen in each pixel, -1 for none: [N, 3, 2] corners in pixels, [N, 3] depths."""
+def covered(
+    screen: Float[np.ndarray, "f 3 2"], depth: Float[np.ndarray, "f 3"], size: tuple[int, int]
+) -> Int[np.ndarray, "h w"]:
+    """The face in the middle of each pixel: the nearest one.
+
+    Args:
+        screen: corners in pixels, x right and y down, (0, 0) the outer corner of the first pixel.
+        depth: distance of each corner from the viewer.
+        size: rows and columns of the picture.
+
+    Returns:
+        Face index, -1 where there is none.
+
+    >>> covered(np.array([[[0.0, 0], [4, 0], [0, 4]]]), np.zeros((1, 3)), (2, 3)).tolist()
+    [[0, 0, 0], [0, 0, 0]]
+    """
     height, width = size
     seen = np.full(height * width, -1)
     nearest = np.full(height * width, np.inf)
@@ -68,7 +80,7 @@ def _covered(
         np.minimum.at(nearest, pixel, value)
         top = value == nearest[pixel]
         seen[pixel[top]] = face[top]
-    return seen.reshape(size), nearest.reshape(size)
+    return seen.reshape(size)
 
 
 def _depth_at(
@@ -125,7 +137,7 @@ def view(
     middle = 0.5 * (low + high)
     x = (points[:, 0] - middle[0]) * scale + width / 2
     y = (middle[1] - points[:, 1]) * scale + fine / 2
-    seen, _ = _covered(np.stack([x, y], 1)[faces], -points[:, 2][faces], (fine, width))
+    seen = covered(np.stack([x, y], 1)[faces], -points[:, 2][faces], (fine, width))
     a, b, c = np.moveaxis(points[faces], 1, 0)
     normal = np.cross(b - a, c - a)
     facing = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)

@@ -176,7 +176,7 @@ def test_transfer_to_itself_to_a_cut_copy_and_to_another_shape(body) -> None:
     model = BodyModel.default()
     shaped = model.shaped(torch.full((10,), 0.3))[0].double().numpy()
     other, taken = transfer_rows(weights, (verts, faces), (shaped, faces), 0.1)
-    assert 0.5 * np.abs(other - weights).sum(1).mean() < 0.03
+    assert 0.5 * np.abs(other - weights).sum(1).mean() < 0.1
     assert np.abs(other.sum(1) - 1).max() < 1e-6 and other.min() >= 0
 
 
