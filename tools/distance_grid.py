@@ -9,6 +9,7 @@ h √(Σ t(1 − t)) over the three axes, at most h √3/2.
 import io
 import math
 import os
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,11 +99,11 @@ class DistanceGrid:
     def load(cls, path: str | os.PathLike[str]) -> "DistanceGrid":
         """Read what `save` wrote; nothing in it is executed."""
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as file:
                 values = file["values"]
                 origin, spacing = file["origin"].astype(np.float64), float(file["spacing"])
                 signed = bool(file["signed"])
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(
                 f"{path}: expected a distance grid as written by bake, found none ({error})"
             ) from error
