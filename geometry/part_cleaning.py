@@ -167,7 +167,8 @@ def _cut(keep: np.ndarray, take: np.ndarray, arcs: np.ndarray, size: np.ndarray)
         return np.zeros(0, bool)
     least = np.minimum(keep, take)
     keep, take = keep - least, take - least
-    scale = _CAPACITY / max(float(max(keep.max(), take.max(), size.max(initial=0.0))), 1e-300)
+    largest = float(max(keep.max(), take.max(), size.max(initial=0.0)))
+    scale = _CAPACITY / largest if largest > 0 else 0.0
     source, sink, nodes = count, count + 1, np.arange(count)
     rows = np.concatenate([np.full(count, source), nodes, arcs[:, 0]])
     cols = np.concatenate([nodes, np.full(count, sink), arcs[:, 1]])
