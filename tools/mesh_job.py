@@ -56,6 +56,8 @@ class Job:
     update: Update
     inputs: list[Path] = field(default_factory=list)
     facts: list[dict[str, Any]] = field(default_factory=list)
+    extra: dict[Path, Callable[[Path], object]] = field(default_factory=dict)
+    """Other results and what writes them, whole or not at all."""
     start: float = field(default_factory=time.monotonic)
 
     def read(self, path: Path) -> Mesh:
@@ -94,6 +96,20 @@ class Job:
         if self.options.out is not None:
             format_of(self.options.out)
         self.guard([p for p in (self.options.out, self.report(), self.picture()) if p])
+
+    def beside(self, ending: str) -> Path:
+        """A further result beside the mesh, guarded like it.
+
+        Args:
+            ending: what stands in place of the mesh's ending.
+
+        Raises:
+            InputError: see `guard`.
+        """
+        out = self.options.out or Path("out")
+        path = out.with_name(out.stem + ending)
+        self.guard([path])
+        return path
 
     def guard(self, targets: Sequence[Path]) -> None:
         """Refuse to replace an input, or another file unless that was allowed.
@@ -168,6 +184,9 @@ class Job:
             self.update(0.9, "writing")
             entry["output"], files = self._write_mesh(mesh, self.options.out)
             written += files
+        for path, write in self.extra.items():
+            write(path)
+            written.append(path)
         picture = self.picture()
         if picture is not None:
             self.update(0.92, "drawing")

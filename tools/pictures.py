@@ -1,13 +1,13 @@
 """Pictures of meshes from front and back, coloured by face, drawn by a z-buffer in numpy."""
 
 import colorsys
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
 
-_BATCH = 1 << 22  # pixels that are tried at once
+from .raster import rasterise
+
 _GROUND = 0.97
 _COLORS = (
     (0.00, 0.45, 0.70),
@@ -58,44 +58,7 @@ def covered(
     >>> covered(np.array([[[0.0, 0], [4, 0], [0, 4]]]), np.zeros((1, 3)), (2, 3)).tolist()
     [[0, 0, 0], [0, 0, 0]]
     """
-    height, width = size
-    seen = np.full(height * width, -1)
-    nearest = np.full(height * width, np.inf)
-    low = np.clip(np.ceil(screen.min(1) - 0.5), 0, [width, height]).astype(np.int64)
-    high = np.clip(np.floor(screen.max(1) - 0.5) + 1, 0, [width, height]).astype(np.int64)
-    span = np.maximum(high - low, 0)
-    work = span.prod(1)
-    cut = np.searchsorted(np.cumsum(work), np.arange(_BATCH, work.sum() + _BATCH, _BATCH))
-    starts = np.unique(np.clip(np.r_[0, cut, len(work)], 0, len(work)))
-    for first, last in itertools.pairwise(starts.tolist()):
-        face = np.repeat(np.arange(first, last), work[first:last])
-        if not len(face):
-            continue
-        begin = np.cumsum(work[first:last]) - work[first:last]
-        step = np.arange(len(face)) - np.repeat(begin, work[first:last])
-        wide = span[face, 0]
-        x, y = low[face, 0] + step % wide, low[face, 1] + step // wide
-        inside, value = _depth_at(screen[face], depth[face], x + 0.5, y + 0.5)
-        pixel, face, value = (y * width + x)[inside], face[inside], value[inside]
-        np.minimum.at(nearest, pixel, value)
-        top = value == nearest[pixel]
-        seen[pixel[top]] = face[top]
-    return seen.reshape(size)
-
-
-def _depth_at(
-    tri: np.ndarray, depth: np.ndarray, x: np.ndarray, y: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    a, b, c = tri[:, 0], tri[:, 1], tri[:, 2]
-
-    def turn(p: np.ndarray, q: np.ndarray, rx: np.ndarray, ry: np.ndarray) -> np.ndarray:
-        return (q[:, 0] - p[:, 0]) * (ry - p[:, 1]) - (q[:, 1] - p[:, 1]) * (rx - p[:, 0])
-
-    area = turn(a, b, c[:, 0], c[:, 1])
-    share = np.stack([turn(b, c, x, y), turn(c, a, x, y), turn(a, b, x, y)], 1)
-    safe = np.where(area == 0, 1.0, area)
-    share /= safe[:, None]
-    return (share >= 0).all(1) & (area != 0), (share * depth).sum(1)
+    return rasterise(screen, depth, *size).face
 
 
 def view(

@@ -46,7 +46,7 @@ def rasterise(
 
     >>> corners = np.array([[[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]]])
     >>> rasterise(corners, np.zeros((1, 3)), 2, 3).face.tolist()
-    [[0, 0, 0], [0, 0, -1]]
+    [[0, 0, 0], [0, 0, 0]]
     """
     nearest = np.full(height * width, np.inf)
     face = np.full(height * width, -1, dtype=np.int64)
@@ -69,7 +69,8 @@ def rasterise(
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    with np.errstate(invalid="ignore", over="ignore"):
+        return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _candidates(

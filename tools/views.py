@@ -7,30 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from .colors import (
+    PLAIN,
+    checker_color,
+    face_distortion,
+    heat_color,
+    part_color,
+    texture_color,
+    unit_box,
+)
 from .meshio import Mesh
 from .raster import Raster, rasterise
 
 _FINE = 2  # samples along the side of a pixel
 _PAPER = np.array([1.0, 1.0, 1.0])
-_PLAIN = np.array([0.72, 0.74, 0.78])
 _FAULT = np.array([0.86, 0.10, 0.12])
 _LIGHT = np.array([0.35, 0.55, 0.76])
-_HEAT = np.array(
-    [
-        [0.19, 0.25, 0.55],
-        [0.25, 0.55, 0.75],
-        [0.75, 0.85, 0.65],
-        [0.95, 0.65, 0.25],
-        [0.7, 0.1, 0.1],
-    ]
-)
-_PARTS = np.array(
-    [
-        *([0.90, 0.62, 0.00], [0.34, 0.71, 0.91], [0.00, 0.62, 0.45], [0.94, 0.89, 0.26]),
-        *([0.00, 0.45, 0.70], [0.84, 0.37, 0.00], [0.80, 0.47, 0.65], [0.55, 0.34, 0.29]),
-        *([0.60, 0.60, 0.60], [0.45, 0.80, 0.45], [0.55, 0.45, 0.80], [0.80, 0.20, 0.35]),
-    ]
-)  # the first seven: Okabe and Ito, told apart by people who see few colours
 Image = np.ndarray
 
 
@@ -40,80 +32,6 @@ class Panel:
 
     title: str
     image: Image
-
-
-def part_color(part: Int[np.ndarray, "*b"]) -> Float[np.ndarray, "*b 3"]:
-    """Colours of parts, sRGB; they repeat after twelve, negative numbers are grey.
-
-    Args:
-        part: part numbers.
-
-    Returns:
-        Colours in [0, 1].
-
-    >>> part_color(np.array([0, -1])).tolist()
-    [[0.9, 0.62, 0.0], [0.72, 0.74, 0.78]]
-    """
-    part = np.asarray(part)
-    return np.where((part < 0)[..., None], _PLAIN, _PARTS[part % len(_PARTS)])
-
-
-def heat_color(
-    values: Float[np.ndarray, "*b"], low: float, high: float
-) -> Float[np.ndarray, "*b 3"]:
-    """Colours from blue (`low`) over green to red (`high` and above); NaN is grey.
-
-    Args:
-        values: numbers.
-        low: the bluest.
-        high: the reddest.
-
-    Returns:
-        Colours in [0, 1].
-    """
-    known = np.isfinite(values)
-    place = np.clip((np.where(known, values, low) - low) / max(high - low, 1e-12), 0, 1)
-    place = place * (len(_HEAT) - 1)
-    start = np.minimum(place.astype(np.int64), len(_HEAT) - 2)
-    part = (place - start)[..., None]
-    colors = _HEAT[start] * (1 - part) + _HEAT[start + 1] * part
-    return np.where(known[..., None], colors, _PLAIN)
-
-
-def checker_color(uv: Float[np.ndarray, "*b 2"], squares: int = 48) -> Float[np.ndarray, "*b 3"]:
-    """A checker board in the unit square, tinted so that places can be told apart.
-
-    Args:
-        uv: texture coordinates.
-        squares: along each side.
-
-    Returns:
-        Colours in [0, 1].
-    """
-    uv = np.nan_to_num(uv)
-    cell = np.floor(uv * squares)
-    odd = (cell.sum(axis=-1) % 2)[..., None]
-    tint = np.stack([uv[..., 0] % 1, uv[..., 1] % 1, 1 - uv[..., 0] % 1], axis=-1)
-    return 0.35 + 0.4 * odd + 0.25 * tint
-
-
-def texture_color(
-    texture: Float[np.ndarray, "H W 3"], uv: Float[np.ndarray, "*b 2"]
-) -> Float[np.ndarray, "*b 3"]:
-    """Nearest texel, repeated beyond the unit square.
-
-    Args:
-        texture: row 0 at v = 1.
-        uv: texture coordinates.
-
-    Returns:
-        Colours.
-    """
-    height, width = texture.shape[:2]
-    uv = np.nan_to_num(uv) % 1
-    column = np.minimum((uv[..., 0] * width).astype(np.int64), width - 1)
-    row = np.minimum(((1 - uv[..., 1]) * height).astype(np.int64), height - 1)
-    return texture[np.clip(row, 0, height - 1), column]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +73,7 @@ def view(mesh: Mesh, size: int = 640) -> View:
     Returns:
         The two sides.
     """
-    verts = _unit(mesh.verts)
+    verts = unit_box(mesh.verts)
     height, width = size * _FINE, size * _FINE // 2
     tall, wide = max(_extent(verts, 1), 1e-9), max(_extent(verts, 0), 1e-9)
     scale = 0.94 * min(height / tall, width / wide)
@@ -169,17 +87,6 @@ def view(mesh: Mesh, size: int = 640) -> View:
         rasters.append(raster)
         shades.append(_shade(verts, mesh.faces, raster, side))
     return View((rasters[0], rasters[1]), (shades[0], shades[1]))
-
-
-def _unit(verts: np.ndarray) -> np.ndarray:
-    """Moved to the middle and scaled to about 1; not finite stays not finite."""
-    finite = verts[np.isfinite(verts).all(axis=1)]
-    if not len(finite):
-        return np.full_like(verts, np.nan)
-    with np.errstate(over="ignore", invalid="ignore"):
-        low, high = finite.min(axis=0), finite.max(axis=0)
-        size = max(float((high / 2 - low / 2).max()), 1e-300)
-        return (verts / size - (high / 2 + low / 2) / size) / 2
 
 
 def _extent(verts: np.ndarray, axis: int) -> float:
@@ -207,40 +114,6 @@ def _smaller(image: Image) -> Image:
         .reshape(height, _FINE, width, _FINE, 3)
         .mean(axis=(1, 3))
     )
-
-
-def face_distortion(mesh: Mesh) -> Float[np.ndarray, "F"]:
-    """Symmetric Dirichlet energy of each face, 4 where nothing is stretched; areas add up to 1.
-
-    Args:
-        mesh: with texture coordinates.
-
-    Returns:
-        s₁² + s₂² + 1/s₁² + 1/s₂² of the singular values of the map from the surface, scaled as a
-        whole so that both areas agree; infinite where a face has no area or is flipped, NaN where
-        the mesh has none.
-
-    Reference:
-        Smith and Schaefer 2015, equation 3.
-    """
-    if mesh.corner_uv is None or not mesh.num_faces:
-        return np.zeros(0)
-    with np.errstate(all="ignore"):
-        corners = _unit(mesh.verts)[mesh.faces]
-        e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        x1 = np.linalg.norm(e1, axis=1)
-        x2 = (e1 * e2).sum(axis=1) / x1
-        y2 = np.linalg.norm(np.cross(e1, e2), axis=1) / x1
-        u1, u2 = (mesh.corner_uv[:, k] - mesh.corner_uv[:, 0] for k in (1, 2))
-        du = u1 / x1[:, None]
-        dv = (u2 - du * x2[:, None]) / y2[:, None]
-        area = x1 * y2
-        det = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]
-        good = np.isfinite(det) & (area > 0)
-        scale = (np.abs(det) * area)[good].sum() / area[good].sum()
-        square = (du**2).sum(axis=1) + (dv**2).sum(axis=1)
-        energy = square / scale + square * scale / det**2
-        return np.where(good, np.where(det > 0, energy, np.inf), np.nan)
 
 
 def uv_panels(mesh: Mesh, size: int = 640) -> list[Panel]:
@@ -337,7 +210,7 @@ def fault_panels(
         elif "vert" in of or "edge" in of:
             verts[chosen[chosen < mesh.num_verts]] = True
     bad |= verts[mesh.faces].any(axis=1)
-    color = np.where(bad[:, None], _FAULT, _PLAIN)
+    color = np.where(bad[:, None], _FAULT, PLAIN)
     title = "faults (red, the worst of each kind)" if bad.any() else "no fault to be seen"
     corner_color = np.repeat(color[:, None], 3, axis=1)
     return [Panel(title, view(mesh, size).colored(corner_color))]
@@ -364,12 +237,12 @@ def surface_panels(mesh: Mesh, title: str, size: int = 640) -> list[Panel]:
     if mesh.weights is not None and mesh.weights.shape[1]:
         mixed = np.nan_to_num(mesh.weights) @ part_color(np.arange(mesh.weights.shape[1]))
         return [Panel(title, seen.colored(np.clip(mixed, 0, 1)[mesh.faces]))]
-    return [Panel(title, seen.colored(np.broadcast_to(_PLAIN, (mesh.num_faces, 3, 3))))]
+    return [Panel(title, seen.colored(np.broadcast_to(PLAIN, (mesh.num_faces, 3, 3))))]
 
 
 def _crosses(mesh: Mesh) -> Mesh:
     """A small triangle at each point, for a picture."""
-    verts = _unit(mesh.verts)
+    verts = unit_box(mesh.verts)
     corners = np.array([[-1.0, -0.6, 0], [1, -0.6, 0], [0, 1, 0]]) * 0.004
     every = (verts[:, None] + corners).reshape(-1, 3)
     colors = None if mesh.colors is None else np.repeat(mesh.colors, 3, axis=0)
