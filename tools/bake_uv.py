@@ -92,7 +92,21 @@ def carried_uv(
         patch = links.around(int(home[row]), middle[row], corners[row])
         near = closest_faces(inner[row], source.verts, source.faces[patch])[0]
         uv[row], gap[row] = _at(source, patch[near], corners[row])
+        # around a thin limb the walk comes back to the other side of the seam
+        expected, centre = _continued(source, int(home[row]), corners[row])
+        reach = np.linalg.norm(expected - centre, axis=1).max()
+        if np.linalg.norm(uv[row] - expected, axis=1).max() > _STRETCH * reach:
+            uv[row] = expected
     return uv, gap, len(odd)
+
+
+def _continued(source: Mesh, face: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates of points by the map of one face, also beyond it; and of their middle."""
+    corner, uv = source.verts[source.faces[face]], _uv(source)[face]
+    sides = np.stack([corner[1] - corner[0], corner[2] - corner[0]], 1)
+    away = np.linalg.lstsq(sides, (points - corner[0]).T, rcond=None)[0].T
+    found = uv[0] + away @ (uv[1:] - uv[0])
+    return found, found.mean(0)
 
 
 def _at(source: Mesh, face: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -97,8 +97,87 @@ def _check(command: argparse.ArgumentParser) -> None:
     _files(command, needs_out=False)
 
 
+def _unwrap(command: argparse.ArgumentParser) -> None:
+    _input(command)
+    text = "mean symmetric Dirichlet energy; 4 keeps all lengths, more gives fewer charts"
+    command.add_argument("--target", type=float, default=4.03, metavar="E", help=text)
+    text = "slim never flips a face; the others are quick, and may flip and overlap"
+    ways = ("slim", "arap", "lscm", "harmonic")
+    command.add_argument("--method", choices=ways, default="slim", help=text)
+    text = "xatlas for comparison"
+    command.add_argument("--engine", choices=("monopart", "xatlas"), default="monopart", help=text)
+    text = "texels along a side (default: 2048)"
+    command.add_argument("--size", type=int, default=2048, metavar="N", help=text)
+    text = "least distance of charts in texels (default: 4)"
+    command.add_argument("--margin", type=float, default=4.0, metavar="N", help=text)
+    text = "make no more charts for the sake of the target"
+    command.add_argument("--max-charts", type=int, metavar="N", help=text)
+    text = "largest part of the surface in one chart"
+    command.add_argument("--chart-share", type=float, metavar="S", help=text)
+    text = "charts of their own for each part: the name of a division as in partition"
+    command.add_argument("--parts", metavar="NAME", help=text)
+    text = "do not mirror the seams of a symmetric mesh"
+    command.add_argument("--no-symmetry", action="store_true", help=text)
+    _files(command)
+
+
+def _partition(command: argparse.ArgumentParser) -> None:
+    _input(command)
+    group = command.add_mutually_exclusive_group()
+    text = "three, five, six, per_limb, any of them with +hands, or single (default: five)"
+    group.add_argument("--parts", default="five", metavar="NAME", help=text)
+    text = 'joints of each part as JSON, such as {"head": [12, 15], ...}'
+    group.add_argument("--table", type=Path, metavar="FILE", help=text)
+    text = "where weights come from: its own, heat from its joints, or transfer from our body"
+    ways = ("auto", "weights", "heat", "transfer")
+    command.add_argument("--method", choices=ways, default="auto", help=text)
+    text = "how far borders may move to become short (default: 1/100 of the size; 0: not at all)"
+    command.add_argument("--smoothing", type=float, metavar="L", help=text)
+    text = "let parts reach this far over their borders"
+    command.add_argument("--band", type=float, metavar="L", help=text)
+    text = "do not make left and right equal (by the plane x = 0)"
+    command.add_argument("--no-symmetry", action="store_true", help=text)
+    _files(command)
+
+
+def _bake(command: argparse.ArgumentParser) -> None:
+    what = ("weights", "uv", "colors", "texture", "distance")
+    text = "what to carry; distance makes a grid (npz) of SOURCE alone"
+    command.add_argument("what", choices=what, help=text)
+    command.add_argument("source", type=Path, metavar="SOURCE", help="mesh to take it from")
+    command.add_argument(
+        "target", type=Path, nargs="?", metavar="TARGET", help="mesh to bake onto, in the same pose"
+    )
+    text = "weights: fill in vertices that are farther away"
+    command.add_argument("--max-distance", type=float, metavar="L", help=text)
+    text = "texture: rows and columns (default: 1024)"
+    command.add_argument("--size", type=int, default=1024, metavar="N", help=text)
+    text = "distance: between nodes (default: 1/64 of the size)"
+    command.add_argument("--spacing", type=float, metavar="L", help=text)
+    text = "distance: around the mesh (default: 1/20 of the size)"
+    command.add_argument("--margin", type=float, metavar="L", help=text)
+    text = "distance: of open meshes too, not negative inside"
+    command.add_argument("--unsigned", action="store_true", help=text)
+    _files(command)
+
+
+def _body(command: argparse.ArgumentParser) -> None:
+    text = "SMPL, SMPL-H or SMPL-X file (default: the free body of the package)"
+    command.add_argument("--source", type=Path, metavar="FILE", help=text)
+    text = "shape coefficients of the subject"
+    command.add_argument("--betas", type=float, nargs="+", default=[], metavar="B", help=text)
+    command.add_argument("--height", type=float, metavar="M", help="stature in metres")
+    text = "level of detail: at most N triangles"
+    command.add_argument("--faces", type=int, metavar="N", help=text)
+    _files(command)
+
+
 COMMANDS: dict[str, tuple[str, Add]] = {
+    "unwrap": ("lay a mesh into the unit square, without flips or overlaps", _unwrap),
+    "partition": ("divide a mesh into body parts, rigged or not", _partition),
     "check": ("look for what makes a mesh unfit: holes, slivers, overlaps, weights", _check),
+    "bake": ("carry weights, textures or colours to another mesh; distance grids", _bake),
+    "body": ("build the body file of a subject", _body),
     "remesh": ("new triangles for the same surface; weights and textures are kept", _remesh),
     "convert": ("write a mesh in another format and say what that loses", _convert),
 }

@@ -49,7 +49,7 @@ def heat_color(
     Returns:
         Colours in [0, 1].
     """
-    known = np.isfinite(values)
+    known = ~np.isnan(values)
     place = np.clip((np.where(known, values, low) - low) / max(high - low, 1e-12), 0, 1)
     place = place * (len(_HEAT) - 1)
     start = np.minimum(place.astype(np.int64), len(_HEAT) - 2)

@@ -88,6 +88,14 @@ class Job:
             InputError: a result would replace a file that must stay.
         """
         self.inputs.append(path)
+        self.guard_all()
+
+    def guard_all(self) -> None:
+        """Refuse options that make no sense and results that would replace what must stay.
+
+        Raises:
+            InputError: see `guard`.
+        """
         if not 16 <= self.options.picture_size <= 4096:
             raise InputError(
                 "--picture-size: expected from 16 to 4096 pixels, found "

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from monopart.geometry.errors import InputError
+from monopart.geometry.weight_transfer import closest_faces
 
 from .meshio import Mesh
-from .transfer import closest_on, transferred
+from .transfer import transferred
 
 Progress = Callable[[float, str], None]
 
@@ -216,8 +217,8 @@ def _area(mesh: Mesh) -> float:
 
 
 def _report(old: Mesh, new: Mesh, method: str, size: float) -> dict[str, Any]:
-    there = closest_on(surface_points(new.verts, new.faces), old.verts, old.faces).distance
-    back = closest_on(surface_points(old.verts, old.faces), new.verts, new.faces).distance
+    there = closest_faces(surface_points(new.verts, new.faces), old.verts, old.faces)[2]
+    back = closest_faces(surface_points(old.verts, old.faces), new.verts, new.faces)[2]
     away = np.concatenate([there, back])
     return {
         "method": method,

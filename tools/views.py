@@ -62,13 +62,14 @@ class View:
         return np.concatenate(sides, axis=1)
 
 
-def view(mesh: Mesh, size: int = 640) -> View:
+def view(mesh: Mesh, size: int = 640, on_top: np.ndarray | None = None) -> View:
     """Look at a mesh along z from both sides, y up, scaled to fill the picture.
 
     Args:
         mesh: the mesh; what is not finite is not seen.
         size: width of the picture in pixels; each side takes half of it, and a flat mesh is given
             less height.
+        on_top: faces that nothing hides, (F) bool.
 
     Returns:
         The two sides.
@@ -78,12 +79,15 @@ def view(mesh: Mesh, size: int = 640) -> View:
     tall, wide = max(_extent(verts, 1), 1e-9), max(_extent(verts, 0), 1e-9)
     scale = 0.94 * min(height / tall, width / wide)
     height = min(height, int(tall * scale * 1.06) // _FINE * _FINE + 40 * _FINE)
+    lift = np.zeros(mesh.num_faces) if on_top is None else np.where(on_top, -1e3, 0.0)
     rasters, shades = [], []
     for side in (1.0, -1.0):
         x = width / 2 + side * scale * verts[:, 0]
         y = height / 2 - scale * verts[:, 1]
         corners = np.stack([x, y], axis=1)[mesh.faces]
-        raster = rasterise(corners, (-side * verts[:, 2])[mesh.faces], height, width)
+        raster = rasterise(
+            corners, (-side * verts[:, 2])[mesh.faces] + lift[:, None], height, width
+        )
         rasters.append(raster)
         shades.append(_shade(verts, mesh.faces, raster, side))
     return View((rasters[0], rasters[1]), (shades[0], shades[1]))
@@ -155,12 +159,12 @@ def _uv_raster(corner_uv: np.ndarray, size: int) -> Raster:
 
 def _layout(raster: Raster, color: Image, mesh: Mesh) -> Image:
     """Charts on grey paper, with a dark line around each."""
-    from .transfer import uv_charts
+    from .bake_uv import uv_charts
 
     label = np.full(raster.face.shape, -1, dtype=np.int64)
     inside = raster.face >= 0
     if mesh.corner_uv is not None:
-        label[inside] = uv_charts(mesh.faces, mesh.corner_uv)[raster.face[inside]]
+        label[inside] = uv_charts(mesh)[raster.face[inside]]
     border = np.zeros(label.shape, dtype=bool)
     border[1:] |= label[1:] != label[:-1]
     border[:, 1:] |= label[:, 1:] != label[:, :-1]
@@ -211,9 +215,13 @@ def fault_panels(
             verts[chosen[chosen < mesh.num_verts]] = True
     bad |= verts[mesh.faces].any(axis=1)
     color = np.where(bad[:, None], _FAULT, PLAIN)
-    title = "faults (red, the worst of each kind)" if bad.any() else "no fault to be seen"
+    title = (
+        "faults (red, the worst of each kind, seen through the surface)"
+        if bad.any()
+        else "no fault to be seen"
+    )
     corner_color = np.repeat(color[:, None], 3, axis=1)
-    return [Panel(title, view(mesh, size).colored(corner_color))]
+    return [Panel(title, view(mesh, size, bad).colored(corner_color))]
 
 
 def surface_panels(mesh: Mesh, title: str, size: int = 640) -> list[Panel]:
@@ -285,3 +293,32 @@ def sheet(panels: Sequence[Panel]) -> Image:
             left += panel.image.shape[1] + gap
         top += max(p.image.shape[0] for p in row) + band + gap
     return np.asarray(paper).astype(np.float64) / 255
+
+
+def grid_panels(values: Float[np.ndarray, "X Y Z"], size: int = 640) -> list[Panel]:
+    """Slices through the middle of a grid of distances: blue inside or near, a dark line at 0.
+
+    Args:
+        values: distances at the nodes.
+        size: of each panel in pixels.
+
+    Returns:
+        Two panels, seen from the front and from the side.
+    """
+    middle = [n // 2 for n in values.shape]
+    slices = {
+        "from the front (x, y)": values[:, :, middle[2]].T[::-1],
+        "from the side (z, y)": values[middle[0]][::-1],
+    }
+    high = float(np.abs(values).max(initial=0.0))
+    panels = []
+    for title, plane in slices.items():
+        many = max(1, size // max(plane.shape))
+        shown = np.repeat(np.repeat(plane, many, axis=0), many, axis=1)
+        color = heat_color(shown, min(float(values.min(initial=0.0)), 0.0), max(high, 1e-12))
+        inside = shown < 0
+        border = np.zeros(inside.shape, dtype=bool)
+        border[1:] |= inside[1:] != inside[:-1]
+        border[:, 1:] |= inside[:, 1:] != inside[:, :-1]
+        panels.append(Panel(title, np.where(border[..., None], 0.1, color)))
+    return panels

@@ -11,8 +11,8 @@ from mesh_samples import cube, tube
 
 from monopart.geometry.errors import InputError
 from monopart.tools import remesh
+from monopart.tools.bake_uv import uv_charts
 from monopart.tools.meshio import Mesh, read_mesh
-from monopart.tools.transfer import uv_charts
 
 pytest.importorskip("pymeshlab", reason="PyMeshLab is not installed (extra tools)")
 
@@ -49,7 +49,7 @@ def test_decimated_body_keeps_its_skin():
         centres = (share.T @ corners.mean(axis=1)) / share.sum(axis=0)[:, None]
         reference = centres if mesh is body else reference
     assert np.abs(centres - reference).max() < 0.01
-    count = [len(np.unique(uv_charts(m.faces, m.corner_uv))) for m in (body, done.mesh)]
+    count = [len(np.unique(uv_charts(m))) for m in (body, done.mesh)]
     assert count[1] >= count[0]
     again = remesh.decimate(body, 3000)
     np.testing.assert_array_equal(again.mesh.verts, done.mesh.verts)

@@ -1,35 +1,13 @@
-"""Closest points and carried attributes, against plain loops over triangles."""
+"""Attributes that are carried to another mesh of the same surface."""
 
 import dataclasses
 
 import numpy as np
-import pytest
 from mesh_samples import cube, tube
-from oracles import closest_on_triangle
 
+from monopart.tools.bake_uv import uv_charts
 from monopart.tools.meshio import Mesh
-from monopart.tools.transfer import closest_on, transferred, uv_charts
-
-
-def test_closest_points_are_those_of_the_loop():
-    mesh = tube()
-    rng = np.random.default_rng(0)
-    points = rng.normal(scale=0.6, size=(60, 3))
-    hit = closest_on(points, mesh.verts, mesh.faces)
-    corners = mesh.verts[mesh.faces]
-    for point, face, bary, distance in zip(points, hit.face, hit.bary, hit.distance, strict=True):
-        every = [np.linalg.norm(closest_on_triangle(point, t) - point) for t in corners]
-        assert distance == pytest.approx(min(every), abs=1e-12)
-        np.testing.assert_allclose(bary.sum(), 1)
-        assert np.linalg.norm(bary @ corners[face] - point) == pytest.approx(distance, abs=1e-9)
-
-
-def test_needles_and_points_are_triangles_too():
-    verts = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    hit = closest_on(np.array([[1.9, 1.0, 0], [-1, 0, 0]]), verts, np.array([[0, 1, 2]]))
-    assert np.isfinite(hit.bary).all()
-    assert hit.bary[1].tolist() == [1, 0, 0]
-    assert len(closest_on(np.zeros((0, 3)), verts, np.array([[0, 1, 2]])).face) == 0
+from monopart.tools.transfer import transferred
 
 
 def test_the_same_mesh_gets_what_it_has():
@@ -76,7 +54,7 @@ def test_two_charts_never_mix():
     mesh = cube()
     uv = np.random.default_rng(0).random((12, 3, 2)) * 0.1 + np.arange(12)[:, None, None]
     mesh = dataclasses.replace(mesh, corner_uv=uv)
-    assert len(np.unique(uv_charts(mesh.faces, uv))) == 12
+    assert len(np.unique(uv_charts(mesh))) == 12
     rng = np.random.default_rng(1)
     jitter = mesh.verts + rng.normal(scale=1e-3, size=(8, 3))
     new = transferred(jitter, mesh.faces[:, [1, 2, 0]], mesh)
