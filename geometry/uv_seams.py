@@ -22,6 +22,8 @@ class Surface:
     edges: MeshEdges
     mirror: Int[np.ndarray, "V"] | None = None
     """The vertex at the mirror image of each vertex, for a symmetric surface."""
+    side: Float[np.ndarray, "V"] | None = None
+    """Signed distance of each vertex from the mirror plane."""
 
     @property
     def faces(self) -> Int[np.ndarray, "F 3"]:
@@ -43,6 +45,15 @@ class Surface:
         floor = 1e-6 * max(float(self.length.max(initial=0.0)), 1e-30)
         return np.maximum(self.length, floor) * (1 + _SHOWN * seen[self.edges.verts].mean(1))
 
+    @classmethod
+    def of(
+        cls, verts: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], symmetric: bool = True
+    ) -> "Surface":
+        """Prepare a mesh, with its mirror plane where it is asked for and there is one."""
+        found = mirror_of(verts, faces) if symmetric else None
+        mirror, side = (None, None) if found is None else found
+        return cls(verts, MeshEdges.of(faces), mirror, side)
+
     def graph(self, cut: CutMesh, cost: Float[np.ndarray, "E"] | None = None) -> Any:
         """Vertices of a cut mesh joined by its uncut edges, weighted by cost."""
         from scipy.sparse import coo_matrix
@@ -60,7 +71,7 @@ class Surface:
 
 def mirror_of(
     verts: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Int[np.ndarray, "V"] | None:
+) -> tuple[Int[np.ndarray, "V"], Float[np.ndarray, "V"]] | None:
     """The vertex nearest to the mirror image of each vertex, if the mesh has a mirror plane.
 
     The planes through the middle of the box across x, y and z are tried, in this order.
@@ -70,7 +81,7 @@ def mirror_of(
         faces: vertex indices.
 
     Returns:
-        Vertex indices, or None where no plane brings 95 % of the vertices onto others (to a tenth
+        Vertex indices and the signed distance of each vertex from the plane, or None where no plane brings 95 % of the vertices onto others (to a tenth
         of the mean edge).
     """
     from scipy.spatial import cKDTree
@@ -89,7 +100,7 @@ def mirror_of(
         if np.quantile(distance, 0.95) <= 0.1 * edge:
             out = np.arange(len(verts))
             out[used] = used[nearest]
-            return out
+            return out, verts[:, axis] - middle[axis]
     return None
 
 

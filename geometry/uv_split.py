@@ -3,11 +3,11 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from .uv_energy import flat_triangles
 from .uv_flatten import laplacian
-from .uv_mesh import CutMesh
+from .uv_mesh import CutMesh, components
 from .uv_newton import factorised
 from .uv_seams import Surface, _shortest, path_edges
 
@@ -50,77 +50,28 @@ def tip_slits(
     """
     distance, before = _shortest(surface.graph(cut), np.unique(cut.border))
     score = smoothed(cut, density)
-    score = np.where((before >= 0) & np.isfinite(distance), score, -1.0)
+    score = np.where((before >= 0) & np.isfinite(distance), score * distance, -1.0)
     order = np.argsort(score, kind="stable")
     peak = np.full(cut.num_charts, -1, np.int64)
     peak[cut.vert_chart[order]] = order
     ends = peak[charts]
     ends = ends[score[ends] > 0]
-    if surface.mirror is not None:
-        ends = np.union1d(ends, _mirrored_ends(surface.mirror, cut, ends))
     return path_edges(surface, cut, before, ends)
 
 
-def _mirrored_ends(mirror: np.ndarray, cut: CutMesh, ends: np.ndarray) -> np.ndarray:
-    """Inner vertices of the cut mesh at the mirror image of some, none next to where it began."""
-    inside = np.full(len(mirror), -1, np.int64)
-    inner = np.flatnonzero(cut.loop < 0)
-    inside[cut.origin[inner]] = inner
-    found = inside[mirror[cut.origin[ends]]]
-    return found[found >= 0]
-
-
-def chart_mates(surface: Surface, cut: CutMesh) -> Int[np.ndarray, "C"]:
-    """The chart that is the mirror image of each one, itself if it is its own, −1 for none.
-
-    Args:
-        surface: the mesh.
-        cut: its cut.
-
-    Returns:
-        Chart numbers.
-    """
-    count = cut.num_charts
-    mates = np.full(count, -1, np.int64)
-    if surface.mirror is None:
-        return mates
-    image = _mirrored_faces(surface)
-    votes = np.zeros(count * count, np.int64)
-    known = image >= 0
-    np.add.at(votes, cut.chart[known] * count + cut.chart[image[known]], 1)
-    votes = votes.reshape(count, count)
-    best = votes.argmax(1)
-    size = np.bincount(cut.chart, minlength=count)
-    good = (votes[np.arange(count), best] > 0.7 * size) & (best[best] == np.arange(count))
-    mates[good] = best[good]
-    return mates
-
-
-def _mirrored_faces(surface: Surface) -> np.ndarray:
-    """A face at the mirror image of each face: one that shares most of its mirrored corners."""
-    from scipy.spatial import cKDTree
-
-    mirror = surface.mirror
-    if mirror is None:
-        return np.full(len(surface.faces), -1, np.int64)
-    centre = surface.verts[surface.faces].mean(1)
-    image = surface.verts[mirror[surface.faces]].mean(1)
-    return cKDTree(centre).query(image)[1]
-
-
 def fiedler(
-    surface: Surface, cut: CutMesh, start: Float[np.ndarray, "W"], mates: Int[np.ndarray, "C"]
+    surface: Surface, cut: CutMesh, start: Float[np.ndarray, "W"], weight: Float[np.ndarray, "F"]
 ) -> Float[np.ndarray, "W"]:
-    """Slowest vibration of each chart, with the symmetry of the mesh.
+    """Slowest vibration of each chart, if its faces weigh as much as given.
 
     Args:
         surface: the mesh.
         cut: its cut.
         start: a first guess.
-        mates: mirror image of each chart.
+        weight: mass of each face; where there is little, the field hardly changes.
 
     Returns:
-        Values at the vertices, of mean zero and unit size in every chart.
+        Values at the vertices, of weighted mean zero and unit size in every chart.
 
     Reference:
         Fiedler 1973; here the cotangent Laplacian with natural borders, by inverse iteration.
@@ -128,8 +79,7 @@ def fiedler(
     from scipy.sparse import diags
 
     flat = flat_triangles(surface.verts, surface.faces)
-    double = flat[:, 0, 0] * flat[:, 1, 1]
-    mass = np.bincount(cut.faces.reshape(-1), np.repeat(double / 6, 3), minlength=len(cut.origin))
+    mass = np.bincount(cut.faces.reshape(-1), np.repeat(weight / 3, 3), minlength=len(cut.origin))
     matrix = laplacian(cut, flat, "cotangent")
     total = np.bincount(cut.vert_chart, mass, minlength=cut.num_charts)
     shift = 1e-4 * mass / total[cut.vert_chart]
@@ -144,69 +94,115 @@ def fiedler(
     x = unit(start)
     for _ in range(_POWER_STEPS):
         x = unit(factors.solve(mass * x))
-    return unit(_symmetrised(surface, cut, x, mates))
-
-
-def _symmetrised(surface: Surface, cut: CutMesh, x: np.ndarray, mates: np.ndarray) -> np.ndarray:
-    """The field of a chart copied to its mirror image; its own image added where it is its own."""
-    if surface.mirror is None or not (mates >= 0).any():
-        return x
-    count, base = cut.num_charts, len(surface.verts)
-    key = cut.vert_chart * base + cut.origin
-    order = np.argsort(key, kind="stable")
-    wanted = np.where(mates >= 0, mates, 0)[cut.vert_chart] * base + surface.mirror[cut.origin]
-    at = np.minimum(np.searchsorted(key[order], wanted), len(order) - 1)
-    found = (key[order[at]] == wanted) & (mates >= 0)[cut.vert_chart]
-    image = np.where(found, x[order[at]], np.nan)
-    own = (mates == np.arange(count))[cut.vert_chart]
-    copy = (mates < np.arange(count))[cut.vert_chart] & (mates >= 0)[cut.vert_chart]
-    both = own & found
-    agree = np.bincount(cut.vert_chart[both], (x * image)[both], minlength=count)
-    sign = np.where(agree >= 0, 1.0, -1.0)[cut.vert_chart]
-    out = np.where(both, (x + sign * np.nan_to_num(image)) / 2, x)
-    # a copied chart whose image is not known at a vertex keeps its own value, by its own sign
-    pair = copy & found
-    agree = np.bincount(cut.vert_chart[pair], (x * image)[pair], minlength=count)
-    sign = np.where(agree >= 0, 1.0, -1.0)[cut.vert_chart]
-    return np.where(copy, np.where(found, image, sign * x), out)
+    return x
 
 
 def split_paths(
     surface: Surface,
     cut: CutMesh,
     field: Float[np.ndarray, "W"],
-    level: Float[np.ndarray, "C"],
+    weight: Float[np.ndarray, "F"],
     charts: Int[np.ndarray, "n"],
 ) -> Int[np.ndarray, "m"]:
-    """Edges of a path across each of some discs, near the level of a field and of least cost.
+    """Edges of a path of least cost across each of some discs, along a zero line of a field.
+
+    Where the field is zero along several lines, the one that halves the weight best is followed.
 
     Args:
         surface: the mesh.
         cut: its cut; the charts are discs.
         field: values at the vertices of the cut mesh.
-        level: the value of each chart along which to cut.
+        weight: of each face.
         charts: numbers of the charts.
 
     Returns:
         Edge indices; a chart without an inner edge gets none.
     """
-    field = field - level[cut.vert_chart]
-    wanted = np.zeros(cut.num_charts, bool)
-    wanted[charts] = True
-    starts, ends = [], []
-    for ring in cut.loops():
-        if wanted[cut.vert_chart[ring[0]]]:
-            pair = _crossings(field[ring])
-            if pair is not None:
-                starts.append(ring[pair[0]])
-                ends.append(ring[pair[1]])
-    if not starts:
+    ends = [e for e in _zero_lines(cut, field, weight, charts) if e is not None]
+    if not ends:
         return np.zeros(0, np.int64)
-    first = np.concatenate(starts)
-    distance, before = _shortest(_across(surface, cut, field, first), first)
-    stops = [e[int(np.argmin(distance[e]))] for e in ends]
-    stops = np.array([s for s in stops if np.isfinite(distance[s])], np.int64)
-    return path_edges(surface, cut, before, stops)
+    follow = np.full(len(cut.origin), -1, np.int64)
+    follow[cut.border[:, 0]] = cut.border[:, 1]
+    back = np.full(len(cut.origin), -1, np.int64)
+    back[cut.border[:, 1]] = cut.border[:, 0]
+    size = np.bincount(cut.vert_chart[cut.border[:, 0]], minlength=cut.num_charts)
+    starts, stops = [], []
+    for first, last in ends:
+        reach = max(1, int(size[cut.vert_chart[first]]) // 40)
+        near_first = _along(follow, back, first, reach)
+        near_last = _along(follow, back, last, reach)
+        near_last = near_last[~np.isin(near_last, near_first)]
+        starts.append(np.setdiff1d(near_first, near_last))
+        stops.append(near_last)
+    begin = np.concatenate(starts)
+    distance, before = _shortest(_across(surface, cut, field, begin), begin)
+    best = [e[int(np.argmin(distance[e]))] for e in stops if len(e)]
+    reached = np.array([v for v in best if np.isfinite(distance[v])], np.int64)
+    return path_edges(surface, cut, before, reached)
+
+
+def _along(follow: np.ndarray, back: np.ndarray, start: int, reach: int) -> np.ndarray:
+    """Border vertices up to some steps before and after one."""
+    out, ahead, behind = [start], start, start
+    for _ in range(reach):
+        ahead, behind = int(follow[ahead]), int(back[behind])
+        out += [ahead, behind]
+    return np.unique(out)
+
+
+def _zero_lines(
+    cut: CutMesh, field: np.ndarray, weight: np.ndarray, charts: np.ndarray
+) -> list[tuple[int, int] | None]:
+    """Border vertices at both ends of the line that halves the weight of each chart best."""
+    above = field[cut.faces].mean(1) > 0
+    uncut = np.flatnonzero(~cut.seams)
+    pairs = cut.edges.face_pairs[uncut]
+    same = above[pairs[:, 0]] == above[pairs[:, 1]]
+    island = components(len(above), pairs[same, 0], pairs[same, 1])
+    mass = np.bincount(island, weight)
+    order = np.argsort(cut.chart[pairs[~same, 0]], kind="stable")
+    line_edges, line_pairs = uncut[~same][order], island[pairs[~same]][order]
+    chart = cut.chart[pairs[~same, 0]][order]
+    out: list[tuple[int, int] | None] = []
+    for number in charts:
+        some = slice(*np.searchsorted(chart, [number, number + 1]))
+        out.append(_best_line(cut, line_edges[some], line_pairs[some], mass))
+    return out
+
+
+def _best_line(
+    cut: CutMesh, edges: np.ndarray, pairs: np.ndarray, mass: np.ndarray
+) -> tuple[int, int] | None:
+    if len(edges) == 0:
+        return None
+    low, high = pairs.min(1), pairs.max(1)
+    key, which = np.unique(low * len(mass) + high, return_inverse=True)
+    tree = np.stack([key // len(mass), key % len(mass)], 1)
+    balance = _balance(tree, mass)
+    half = cut.edges.sides[edges, 0]
+    a = cut.faces.reshape(-1)[half]
+    b = cut.faces.reshape(-1)[half - half % 3 + (half + 1) % 3]
+    for line in np.argsort(-balance, kind="stable"):
+        own = np.concatenate([a[which == line], b[which == line]])
+        verts, degree = np.unique(own, return_counts=True)
+        ends = verts[(degree == 1) & (cut.loop[verts] >= 0)]
+        if len(ends) == 2:
+            return int(ends[0]), int(ends[1])
+    return None
+
+
+def _balance(tree: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """For each edge of a small tree the mass on its lighter side."""
+    out = np.zeros(len(tree))
+    nodes, local = np.unique(tree, return_inverse=True)
+    local = local.reshape(-1, 2)
+    for i in range(len(tree)):
+        others = np.delete(local, i, 0)
+        side = components(len(nodes), others[:, 0], others[:, 1])
+        here = mass[nodes[side == side[local[i, 0]]]].sum()
+        there = mass[nodes[side == side[local[i, 1]]]].sum()
+        out[i] = min(here, there) if side[local[i, 0]] != side[local[i, 1]] else 0.0
+    return out
 
 
 def _across(surface: Surface, cut: CutMesh, field: np.ndarray, first: np.ndarray) -> Any:
@@ -226,59 +222,32 @@ def _across(surface: Surface, cut: CutMesh, field: np.ndarray, first: np.ndarray
     return coo_matrix(values, graph.shape).tocsr()
 
 
-def _crossings(values: Float[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Places of a ring at which a path may begin and end: around two far changes of sign."""
-    count = len(values)
-    positive = values > 0
-    change = np.flatnonzero(positive != np.roll(positive, -1))
-    if count < 4:
-        return None
-    if len(change) < 2:  # the level misses the border: cut between two opposite places
-        change = np.array([0, count // 2])
-    gap = np.abs(change[:, None] - change[None])
-    gap = np.minimum(gap, count - gap)
-    i, j = np.unravel_index(int(gap.argmax()), gap.shape)
-    reach = max(1, count // 16, 1)
-    reach = min(reach, (int(gap[i, j]) - 1) // 2)
-    window = np.arange(-reach, reach + 1)
-    return (change[i] + window) % count, (change[j] + window) % count
-
-
-def level_of(
-    cut: CutMesh, field: Float[np.ndarray, "W"], weight: Float[np.ndarray, "F"]
-) -> Float[np.ndarray, "C"]:
-    """Weighted median of a field in each chart.
+def separators(
+    surface: Surface, cut: CutMesh, pairs: Int[np.ndarray, "n 2"], field: Float[np.ndarray, "W"]
+) -> Float[np.ndarray, "W"]:
+    """A field that is positive on one face of each pair and negative on the other.
 
     Args:
-        cut: the cut mesh.
-        field: values at its vertices.
-        weight: of each face.
+        surface: the mesh.
+        cut: its cut.
+        pairs: faces of one chart that a path has to separate.
+        field: which of two faces is the high one, at the vertices.
 
     Returns:
-        One value per chart.
+        Values at the vertices.
     """
+    from scipy.sparse import diags
+
+    flat = flat_triangles(surface.verts, surface.faces)
     value = field[cut.faces].mean(1)
-    order = np.lexsort((value, cut.chart))
-    chart, value, weight = cut.chart[order], value[order], weight[order]
-    total = np.bincount(chart, weight, minlength=cut.num_charts)
-    start = np.concatenate([[0.0], np.cumsum(total)[:-1]])
-    share = (np.cumsum(weight) - start[chart]) / np.maximum(total[chart], 1e-300)
-    reached = np.flatnonzero(share >= 0.5)
-    _, first = np.unique(chart[reached], return_index=True)
-    return value[reached[first]]
-
-
-def seam_mask(count: int, *groups: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "E"]:
-    """Mask of some edges.
-
-    Args:
-        count: number of edges.
-        *groups: their indices.
-
-    Returns:
-        The mask.
-    """
-    mask = np.zeros(count, bool)
-    for group in groups:
-        mask[group] = True
-    return mask
+    swap = value[pairs[:, 0]] < value[pairs[:, 1]]
+    high = np.unique(np.where(swap, pairs[:, 1], pairs[:, 0]))
+    low = np.unique(np.where(swap, pairs[:, 0], pairs[:, 1]))
+    matrix = laplacian(cut, flat, "uniform")
+    count = len(cut.origin)
+    held = np.full(count, 1e-6)
+    pull = np.zeros(count)
+    for faces, sign in ((high, 1.0), (low, -1.0)):
+        np.add.at(held, cut.faces[faces].reshape(-1), 10.0)
+        np.add.at(pull, cut.faces[faces].reshape(-1), sign * 10.0)
+    return factorised((matrix + diags(held)).tocsc()).solve(pull)
