@@ -2,13 +2,15 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .uv_energy import ISOMETRIC, RestShape, face_energy
-from .uv_flatten import flipped_charts, harmonic_map, slim_start
+from .uv_flatten import arap_map, flipped_charts, harmonic_map, lscm_map, slim_start
 from .uv_mesh import CutMesh
+from .uv_mirror import chart_mates, mirrored_edges
 from .uv_newton import NewtonSolver
 from .uv_overlap import overlapping_pairs
 from .uv_seams import Surface, cut_to_discs
@@ -119,6 +121,57 @@ def first_atlas(surface: Surface, seams: Bool[np.ndarray, "E"]) -> Atlas:
     uv = np.zeros((len(cut.origin), 2))
     uv[cut.faces[:, 1:]] = np.linalg.inv(rest.inverse).transpose(0, 2, 1)
     return Atlas(surface, rest, cut, uv)
+
+
+def shared_out(
+    surface: Surface, seams: Bool[np.ndarray, "E"], share: float
+) -> Bool[np.ndarray, "E"]:
+    """Add the seams that leave no chart with more than a share of the area, and only discs.
+
+    Args:
+        surface: the mesh.
+        seams: edges that must be cut.
+        share: of the whole area.
+
+    Returns:
+        Edges to cut.
+    """
+    area = RestShape.of(surface.verts, surface.faces).area
+    for _ in range(_ROUNDS):
+        seams = cut_to_discs(surface, seams)
+        cut = CutMesh.of(surface.edges, seams)
+        sizes = np.bincount(cut.chart, area, minlength=cut.num_charts)
+        large = np.flatnonzero(sizes > share * area.sum() * (1 + 1e-6))
+        mates = chart_mates(surface, cut)
+        leads = large[~((mates[large] >= 0) & (mates[large] < large))]
+        extra = halves(surface, cut, leads, area)
+        owner = cut.chart[np.maximum(cut.edges.face_pairs[extra, 0], 0)]
+        extra = np.concatenate([extra, mirrored_edges(surface, extra[mates[owner] > owner])])
+        extra = extra[~seams[extra]]
+        if len(extra) == 0:
+            break
+        seams = seams.copy()
+        seams[extra] = True
+    return seams
+
+
+def atlas_by_method(
+    surface: Surface, seams: Bool[np.ndarray, "E"], method: Literal["arap", "lscm", "harmonic"]
+) -> Atlas:
+    """Discs flattened by a method that may flip faces.
+
+    Args:
+        surface: the mesh.
+        seams: edges that must be cut.
+        method: "harmonic", "lscm" or "arap".
+
+    Returns:
+        The discs; each scaled to its area.
+    """
+    cut = CutMesh.of(surface.edges, cut_to_discs(surface, seams))
+    maps = {"harmonic": harmonic_map, "lscm": lscm_map, "arap": arap_map}
+    uv = maps[method](cut, surface.verts)
+    return Atlas(surface, RestShape.of(surface.verts, surface.faces), cut, uv)
 
 
 def halves(
