@@ -111,9 +111,7 @@ def unwrap(
     if chosen["engine"] == "xatlas":
         from .uv_xatlas import xatlas_layout
 
-        corner_uv, chart = xatlas_layout(
-            points, corners, labels, chosen["size"], chosen["margin"]
-        )
+        corner_uv, chart = xatlas_layout(points, corners, labels, chosen["size"], chosen["margin"])
     else:
         corner_uv, chart = _layout(points, corners, labels, chosen, progress)
     corner_uv = np.round(corner_uv / GRID) * GRID

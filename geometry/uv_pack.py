@@ -121,7 +121,9 @@ def coverage(
     number = wide[:, 0] * wide[:, 1]
     face = np.repeat(np.arange(len(corner)), number)
     rank = np.arange(len(face)) - np.repeat(np.cumsum(number) - number, number)
-    cell = np.stack([first[face, 0] + rank % wide[face, 0], first[face, 1] + rank // wide[face, 0]], 1)
+    cell = np.stack(
+        [first[face, 0] + rank % wide[face, 0], first[face, 1] + rank // wide[face, 0]], 1
+    )
     middle = cell + 0.5
     side = np.roll(corner, -1, 1) - corner
     turned = np.sign(side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0])
@@ -185,7 +187,9 @@ class _Board:
     def widened(self) -> "_Board":
         """The same with more room."""
         canvas = _round_up(int(1.3 * self.canvas))
-        return _Board(self.stamps, [_spectra(own, canvas) for own in self.stamps], self.unit, canvas)
+        return _Board(
+            self.stamps, [_spectra(own, canvas) for own in self.stamps], self.unit, canvas
+        )
 
     def placed(self, recipe: _Recipe, width: int) -> list[tuple[int, int, int]] | None:
         """Turn, row and column of each chart in a square of some cells; None if they do not fit."""

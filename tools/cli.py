@@ -16,6 +16,9 @@ BAD_INPUT = 2
 INTERRUPTED = 130
 FORMATS = "obj, ply, stl, glb, gltf, npz"
 
+ERRORS = (MonopartError, ValueError, RuntimeError, ArithmeticError, LookupError, TypeError)
+"""What a command may end with; libraries raise the others on meshes they were not made for."""
+
 Add = Callable[[argparse.ArgumentParser], None]
 
 PROGRAM = f"""Tools for meshes and bodies. Files: {FORMATS} (npz in the layout of SMPL files).
@@ -199,20 +202,34 @@ def main(argv: Sequence[str] | None = None) -> int | None:
         from .mesh_commands import run
 
         return run(arguments)
-    except MonopartError as error:
-        return _fail(str(error))
-    except ModuleNotFoundError as error:
-        missing = (error.name or "").partition(".")[0]
-        if not missing or missing == "monopart":
-            raise
-        return _fail(f"the package {missing} is not installed; install it by {INSTALL}")
     except KeyboardInterrupt:
         print("monopart-mesh: interrupted", file=sys.stderr)
         return INTERRUPTED
-    except OSError as error:
-        return _fail(f"{error.filename or arguments.command}: {error.strerror or error}")
-    except MemoryError:
-        return _fail("expected a mesh that fits into memory, found a larger one; decimate it first")
+    except (*ERRORS, OSError, MemoryError, ModuleNotFoundError) as error:
+        message = _said(error, arguments.command)
+        if message is None:
+            raise
+        return _fail(message)
+
+
+def _said(error: Exception, command: str) -> str | None:
+    """An error in one line; None for those that only a developer can understand."""
+    if isinstance(error, MonopartError):
+        return str(error)
+    if isinstance(error, ModuleNotFoundError):
+        missing = (error.name or "").partition(".")[0]
+        ours = not missing or missing == "monopart"
+        return None if ours else f"the package {missing} is not installed; install it by {INSTALL}"
+    if isinstance(error, OSError):
+        return f"{error.filename or command}: {error.strerror or error}"
+    if isinstance(error, MemoryError):
+        return "expected a mesh that fits into memory, found a larger one; decimate it first"
+    if os.environ.get("MONOPART_DEBUG"):
+        return None
+    return (
+        f"{command} failed on this mesh ({type(error).__name__}: {error}); look at it with "
+        "monopart-mesh check, and set MONOPART_DEBUG=1 for all of the error"
+    )
 
 
 def _fail(message: str) -> int:
