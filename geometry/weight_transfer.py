@@ -11,8 +11,8 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .bone_heat import solved_rows
 from .errors import InputError
-from .heat_weights import solved_rows
 from .mesh_graph import check_mesh, components, weld_by_place
 
 

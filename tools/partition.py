@@ -15,9 +15,9 @@ from jaxtyping import Float, Int
 
 from monopart.geometry.alignment import Similarity, align
 from monopart.geometry.atomic import write_bytes, write_json
+from monopart.geometry.bone_heat import heat_weights
 from monopart.geometry.errors import InputError
 from monopart.geometry.geodesics import PartBands, part_bands
-from monopart.geometry.heat_weights import heat_weights
 from monopart.geometry.joint_names import joint_names
 from monopart.geometry.mesh_graph import MeshGraph, components, face_graph
 from monopart.geometry.part_cleaning import clean_face_labels, label_shares, vertex_labels
