@@ -103,14 +103,14 @@ class _Checker:
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self.verts, self.faces = mesh.verts, mesh.faces
-        self.finite = np.isfinite(self.verts).all(1)
+        self.finite = np.asarray(np.isfinite(self.verts).all(axis=1))
         size = np.abs(self.verts[self.finite]).max(initial=0.0)
         # far from 1 squares overflow or vanish; a power of two changes no digit
         self.unit = 1.0 if size == 0 else 2.0 ** np.floor(np.log2(size))
         clean = np.where(self.finite[:, None], self.verts, 0.0) / self.unit
         self.scaled = clean
         self.welded = self._welded()
-        self.sound = self.finite[self.faces].all(1)
+        self.sound = self.finite[self.faces].all(axis=1)
         used = clean[np.unique(self.faces[self.sound])]
         self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0))) if len(used) else 0.0
 
@@ -302,14 +302,14 @@ def _weights(data: _Checker) -> Iterator[Finding]:
 
 
 def _symmetry(data: _Checker, plane: float) -> Finding:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     known = np.flatnonzero(data.finite)
     points = data.scaled[known]
     gap = np.zeros(len(points))
     if len(points):
         mirror = points * [-1, 1, 1] + np.array([2 * plane / data.unit, 0, 0])
-        gap = cKDTree(points).query(mirror)[0]
+        gap = KDTree(points).query(mirror)[0]
     off = gap > 1e-3 * data.diagonal
     text = f"have no vertex at their mirror image in x = {plane:g}, to a thousandth of the diagonal"
     values = gap[off] * data.unit

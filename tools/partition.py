@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -336,7 +336,7 @@ def write_partition(
     import io
 
     place = Path(folder)
-    arrays = {
+    arrays: dict[str, Any] = {
         "names": np.array(parts.names),
         "face_part": parts.face_part,
         "vertex_part": parts.vertex_part,
