@@ -120,8 +120,27 @@ def _quarter_turns() -> list[np.ndarray]:
     return turns
 
 
-def _iterated(start: Similarity, source: np.ndarray, target: np.ndarray, steps: int) -> Similarity:
-    """Closest points both ways, then the best similarity, again and again."""
+def iterated(
+    start: Similarity,
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "m 3"],
+    steps: int,
+) -> Similarity:
+    """Closest points both ways, then the best similarity, again and again.
+
+    Args:
+        start: where to begin.
+        source: points that are moved.
+        target: points that stay.
+        steps: most iterations; fewer when nothing changes.
+
+    Returns:
+        The similarity after the last step.
+
+    >>> start = Similarity(1.0, np.eye(3), np.array([0.1, 0, 0]))
+    >>> iterated(start, np.eye(3), np.eye(3), 5).shift.round(6).tolist()
+    [0.0, 0.0, 0.0]
+    """
     from scipy.spatial import KDTree
 
     tree, found = KDTree(target), start
@@ -170,8 +189,8 @@ def align(
     tries = []
     for turn in _quarter_turns():
         start = Similarity(scale, turn, centre[1] - scale * turn @ centre[0])
-        tries.append(_iterated(start, coarse[0], coarse[1], _COARSE[1]))
+        tries.append(iterated(start, coarse[0], coarse[1], _COARSE[1]))
     best = sorted(tries, key=lambda found: found.residual)[:_KEPT]
     fine = [surface_points(mesh[0], mesh[1], _FINE[0]) for mesh in (source, target)]
-    refined = [_iterated(start, fine[0], fine[1], _FINE[1]) for start in best]
+    refined = [iterated(start, fine[0], fine[1], _FINE[1]) for start in best]
     return min(refined, key=lambda found: found.residual)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from monopart.geometry.alignment import Similarity, align
+from monopart.geometry.alignment import Similarity
 from monopart.geometry.atomic import write_bytes, write_json
 from monopart.geometry.bone_heat import heat_weights
 from monopart.geometry.errors import InputError
@@ -32,6 +32,7 @@ from monopart.geometry.weight_transfer import transfer_rows
 from .images import encoded
 from .meshio import Mesh, Skeleton, read_mesh
 from .pictures import front_and_back, part_colors
+from .templates import fitted_person
 
 Method = Literal["auto", "weights", "heat", "transfer"]
 _FAR = 0.06  # a body surface farther away gives no weights, in diagonals of the body
@@ -156,9 +157,9 @@ def weights_of(
             f"method: expected auto, weights, heat or transfer, found {method!r}; choose one"
         )
     body = default_body()
-    moved = align((mesh.verts, mesh.faces), (body.verts, body.faces))
-    size = float(np.linalg.norm(np.ptp(body.verts, axis=0)))
-    source = _rows(body), (body.verts, body.faces)
+    posed, moved = fitted_person(body, mesh.verts, mesh.faces)
+    size = float(np.linalg.norm(np.ptp(posed, axis=0)))
+    source = _rows(body), (posed, body.faces)
     rows, _ = transfer_rows(*source, (moved(mesh.verts), mesh.faces), _FAR * size)
     return rows, body.skeleton, chosen, moved
 
