@@ -120,15 +120,34 @@ def _quarter_turns() -> list[np.ndarray]:
     return turns
 
 
-def _iterated(start: Similarity, source: np.ndarray, target: np.ndarray, steps: int) -> Similarity:
-    """Closest points both ways, then the best similarity, again and again."""
-    from scipy.spatial import cKDTree
+def iterated(
+    start: Similarity,
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "m 3"],
+    steps: int,
+) -> Similarity:
+    """Closest points both ways, then the best similarity, again and again.
 
-    tree, found = cKDTree(target), start
+    Args:
+        start: where to begin.
+        source: points that are moved.
+        target: points that stay.
+        steps: most iterations; fewer when nothing changes.
+
+    Returns:
+        The similarity after the last step.
+
+    >>> start = Similarity(1.0, np.eye(3), np.array([0.1, 0, 0]))
+    >>> iterated(start, np.eye(3), np.eye(3), 5).shift.round(6).tolist()
+    [0.0, 0.0, 0.0]
+    """
+    from scipy.spatial import KDTree
+
+    tree, found = KDTree(target), start
     for _ in range(steps):
         moved = found(source)
         there = tree.query(moved)[1]
-        back = cKDTree(moved).query(target)[1]
+        back = KDTree(moved).query(target)[1]
         pairs = np.concatenate([source, source[back]]), np.concatenate([target[there], target])
         better = fitted_similarity(*pairs)
         done = abs(better.residual - found.residual) < 1e-7 and found is not start
@@ -163,15 +182,15 @@ def align(
     """
     for verts, faces in (source, target):
         check_mesh(verts, faces)
-    coarse = [surface_points(*mesh, _COARSE[0]) for mesh in (source, target)]
+    coarse = [surface_points(mesh[0], mesh[1], _COARSE[0]) for mesh in (source, target)]
     centre = [points.mean(0) for points in coarse]
     spread = [np.sqrt(((p - c) ** 2).sum(1).mean()) for p, c in zip(coarse, centre, strict=True)]
     scale = float(spread[1] / max(spread[0], 1e-300))
     tries = []
     for turn in _quarter_turns():
         start = Similarity(scale, turn, centre[1] - scale * turn @ centre[0])
-        tries.append(_iterated(start, *coarse, _COARSE[1]))
+        tries.append(iterated(start, coarse[0], coarse[1], _COARSE[1]))
     best = sorted(tries, key=lambda found: found.residual)[:_KEPT]
-    fine = [surface_points(*mesh, _FINE[0]) for mesh in (source, target)]
-    refined = [_iterated(start, *fine, _FINE[1]) for start in best]
+    fine = [surface_points(mesh[0], mesh[1], _FINE[0]) for mesh in (source, target)]
+    refined = [iterated(start, fine[0], fine[1], _FINE[1]) for start in best]
     return min(refined, key=lambda found: found.residual)

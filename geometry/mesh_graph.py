@@ -218,13 +218,14 @@ def mirror_faces(
     >>> mirror_faces(square, np.array([[0, 3, 2], [3, 1, 2]]))
     array([1, 0])
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if not len(faces):
         return np.zeros(0, np.int64)
     centre = verts[faces].mean(1)
     edge = np.linalg.norm(verts[faces] - verts[np.roll(faces, 1, 1)], axis=2).mean()
     turned = centre * [-1, 1, 1] + [2 * plane, 0, 0]
-    gap, other = cKDTree(centre).query(turned)
+    found = KDTree(centre).query(turned)
+    gap, other = np.asarray(found[0]), np.asarray(found[1])
     mutual = (other[other] == np.arange(len(faces))) & (gap <= tolerance * edge)
     return np.where(mutual, other, -1)

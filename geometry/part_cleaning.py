@@ -284,7 +284,7 @@ def vertex_labels(
     >>> vertex_labels(np.array([1]), np.eye(3), np.array([[0, 1, 2]]), 2)
     array([1, 1, 1])
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     graph = vertex_graph(verts, faces)
     if not len(faces):
@@ -300,7 +300,7 @@ def vertex_labels(
     # angles are rounded: those of twins left and right must not differ
     found = np.round(share, 9).argmax(1)
     used = share.any(1)
-    found[~used] = found[used][cKDTree(verts[used]).query(verts[~used])[1]] if (~used).any() else 0
+    found[~used] = found[used][KDTree(verts[used]).query(verts[~used])[1]] if (~used).any() else 0
     return remove_islands(found, graph)
 
 

@@ -194,7 +194,8 @@ class PartMap:
         label = clean_face_labels(shares, points, corners, smoothing)
         vertex = vertex_labels(label, points, corners, len(part))
         table = torch.tensor(part, device=weights.device)
-        return tuple(table[torch.from_numpy(x).to(weights.device)] for x in (label, vertex))
+        rows = [torch.from_numpy(x).to(weights.device) for x in (label, vertex)]
+        return table[rows[0]], table[rows[1]]
 
     def _joint_part(self, weights: Tensor) -> Tensor:
         if weights.shape[-1] != len(self.joint_part):

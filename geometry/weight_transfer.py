@@ -11,8 +11,8 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .bone_heat import solved_rows
 from .errors import InputError
-from .heat_weights import solved_rows
 from .mesh_graph import check_mesh, components, weld_by_place
 
 
@@ -47,14 +47,12 @@ def closest_faces(
         raise InputError("points: expected finite numbers, found others; clean the mesh")
     if not len(points):
         return np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0)
-    square, face, near = igl.point_mesh_squared_distance(
+    found = igl.point_mesh_squared_distance(
         np.ascontiguousarray(points), np.ascontiguousarray(verts), np.ascontiguousarray(faces)
-    )[:3]
-    return (
-        face.astype(np.int64),
-        barycentrics(near, verts[faces[face]]),
-        np.sqrt(np.maximum(square, 0)),
     )
+    square, face, near = (np.asarray(x) for x in found[:3])
+    face = face.astype(np.int64)
+    return face, barycentrics(near, verts[faces[face]]), np.sqrt(np.maximum(square, 0))
 
 
 def barycentrics(

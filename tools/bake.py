@@ -229,7 +229,10 @@ def bake_texture(
     image = np.zeros((size, size, 3))
     image[rows, cols] = _colors_at(source, hit, bary)
     if len(rows) and gutter:
-        away, nearest = distance_transform_edt(seen < 0, return_indices=True)
+        nearest = np.asarray(
+            distance_transform_edt(seen < 0, return_distances=False, return_indices=True)
+        )
+        away = np.hypot(*(nearest - np.indices(seen.shape)))
         fill = (away > 0) & (away <= gutter)
         image[fill] = image[nearest[0][fill], nearest[1][fill]]
     notes = () if len(rows) else ("no texel is covered: the size is too small or the uv is empty",)

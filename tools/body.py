@@ -10,6 +10,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -130,7 +131,8 @@ def _thinned(body: BodyArrays, num_faces: int) -> tuple[np.ndarray, np.ndarray]:
             f"branching edges and {len(shape.pinched_verts)} pinched vertices; clean the body first"
         )
     start = np.asfortranarray(body.v_template), np.asfortranarray(body.faces.astype(np.int32))
-    verts, faces = igl.qslim(*start, num_faces)[:2]
+    found = igl.qslim(start[0], start[1], num_faces)
+    verts, faces = np.asarray(found[0]), np.asarray(found[1])
     used, faces = np.unique(faces, return_inverse=True)
     faces = faces.reshape(-1, 3).astype(np.int64)
     if not _FEWEST // 2 <= len(faces) <= num_faces + 2:
@@ -143,10 +145,10 @@ def _thinned(body: BodyArrays, num_faces: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _regressor(body: BodyArrays, template: np.ndarray, shapedirs: np.ndarray) -> np.ndarray:
     """Rows over the new vertices that give the old joints, for every shape."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     # first each old vertex hands its share to the nearest new one
-    nearest = cKDTree(template).query(body.v_template)[1]
+    nearest = KDTree(template).query(body.v_template)[1]
     rows = np.zeros((len(body.joint_regressor), len(template)))
     np.add.at(rows.T, nearest, body.joint_regressor.T)
 
@@ -245,7 +247,7 @@ def write_body(path: str | os.PathLike[str], body: BodyArrays) -> Path:
     target = Path(path)
     if target.suffix.lower() != ".npz":
         raise InputError(f"{target}: expected a file that ends in .npz, found {target.suffix!r}")
-    members = body_members(body)
+    members: dict[str, Any] = {**body_members(body)}
     check_body(dict(members), str(target))
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **members)

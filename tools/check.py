@@ -9,11 +9,13 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from monopart.geometry.mesh_graph import face_areas, weld_by_place
 
 from .intersections import self_intersections, uv_faults
 from .meshio import WEIGHTS_SUM, Mesh
+from .pictures import front_and_back
 from .topology import Topology, topology
 
 Severity = Literal["error", "warning", "note"]
@@ -70,6 +72,8 @@ class CheckReport:
     """In a fixed order; those with a count of 0 passed."""
     numbers: dict[str, float] = field(default_factory=dict)
     """Vertices, faces, pieces, holes, Euler number, area, volume (closed meshes), diagonal."""
+    faulty: Bool[np.ndarray, "F"] | None = None
+    """Faces with an error, or at a vertex or an edge with one."""
 
     @property
     def ok(self) -> bool:
@@ -103,14 +107,15 @@ class _Checker:
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self.verts, self.faces = mesh.verts, mesh.faces
-        self.finite = np.isfinite(self.verts).all(1)
+        self.finite = np.asarray(np.isfinite(self.verts).all(axis=1))
         size = np.abs(self.verts[self.finite]).max(initial=0.0)
         # far from 1 squares overflow or vanish; a power of two changes no digit
         self.unit = 1.0 if size == 0 else 2.0 ** np.floor(np.log2(size))
         clean = np.where(self.finite[:, None], self.verts, 0.0) / self.unit
         self.scaled = clean
         self.welded = self._welded()
-        self.sound = self.finite[self.faces].all(1)
+        self.faulty = np.zeros(len(self.faces), bool)
+        self.sound = self.finite[self.faces].all(axis=1)
         used = clean[np.unique(self.faces[self.sound])]
         self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0))) if len(used) else 0.0
 
@@ -118,6 +123,20 @@ class _Checker:
         first = weld_by_place(self.scaled)
         first[~self.finite] = np.flatnonzero(~self.finite)
         return first
+
+    def mark(self, rows: np.ndarray, of: str) -> None:
+        """Remember the faces of an error: those given, or those at all given vertices of a row."""
+        if "faces" in of:
+            self.faulty[rows] = True
+        elif rows.ndim == 1:
+            self.faulty |= np.isin(self.faces, rows).any(axis=1)
+        else:
+            ends = np.sort(self.welded[self.faces][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+            both = np.unique(np.concatenate([rows, ends]), axis=0, return_inverse=True)[1].reshape(
+                -1
+            )
+            hit = np.isin(both[len(rows) :], both[: len(rows)])
+            self.faulty |= hit.reshape(-1, 3).any(axis=1)
 
     def faults(
         self,
@@ -131,6 +150,8 @@ class _Checker:
     ) -> Finding:
         """A finding; rows [N] or [N, K] of faces or vertices, values larger for worse ones."""
         rows = np.asarray(rows, np.int64)
+        if severity == "error" and len(rows):
+            self.mark(rows, of)
         order = np.arange(len(rows)) if values is None else np.argsort(-values, kind="stable")
         worst = []
         for k in order[:_SHOWN]:
@@ -171,7 +192,25 @@ def check_mesh(
     findings += [*_texture(data), *_weights(data)]
     if symmetry_plane is not None:
         findings.append(_symmetry(data, symmetry_plane))
-    return CheckReport(mesh.name, tuple(findings), _facts(data, shape, whole))
+    return CheckReport(mesh.name, tuple(findings), _facts(data, shape, whole), data.faulty)
+
+
+def check_picture(mesh: Mesh, report: CheckReport, height: int = 640) -> Float[np.ndarray, "h w 3"]:
+    """The mesh in grey from front and back, faces with an error in red.
+
+    Args:
+        mesh: the mesh, y up and front at +z.
+        report: its report.
+        height: rows of a view.
+
+    Returns:
+        sRGB in [0, 1].
+    """
+    good, bad = np.array([0.72, 0.74, 0.78]), np.array([0.9, 0.1, 0.1])
+    faulty = np.zeros(mesh.num_faces, bool) if report.faulty is None else report.faulty
+    colors = np.where(faulty[:, None], bad, good)
+    legend = [(f"{int(faulty.sum())} faces with an error", bad), ("no error", good)]
+    return front_and_back(mesh.verts, mesh.faces, colors, legend, height)
 
 
 def _whole(data: _Checker) -> np.ndarray:
@@ -302,14 +341,14 @@ def _weights(data: _Checker) -> Iterator[Finding]:
 
 
 def _symmetry(data: _Checker, plane: float) -> Finding:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     known = np.flatnonzero(data.finite)
     points = data.scaled[known]
     gap = np.zeros(len(points))
     if len(points):
         mirror = points * [-1, 1, 1] + np.array([2 * plane / data.unit, 0, 0])
-        gap = cKDTree(points).query(mirror)[0]
+        gap = KDTree(points).query(mirror)[0]
     off = gap > 1e-3 * data.diagonal
     text = f"have no vertex at their mirror image in x = {plane:g}, to a thousandth of the diagonal"
     values = gap[off] * data.unit

@@ -54,11 +54,16 @@ def _segment_in_plane(ends: list[np.ndarray], tri: list[np.ndarray]) -> np.ndarr
     return hit
 
 
+def _side(tri: list[np.ndarray], points: np.ndarray) -> np.ndarray:
+    """On which side of triangles points lie."""
+    return orient3d(tri[0], tri[1], tri[2], points).astype(int)
+
+
 def _edge_cuts(p: np.ndarray, q: np.ndarray, tri: list[np.ndarray]) -> np.ndarray:
     """Whether closed segments touch closed triangles with area; all [N, 3]."""
-    side_p, side_q = orient3d(*tri, p), orient3d(*tri, q)
+    side_p, side_q = _side(tri, p), _side(tri, q)
     hit = np.zeros(len(p), bool)
-    near = np.flatnonzero((side_p.astype(int) * side_q <= 0) & ((side_p != 0) | (side_q != 0)))
+    near = np.flatnonzero((side_p * side_q <= 0) & ((side_p != 0) | (side_q != 0)))
     if len(near):
         a, b, c = (x[near] for x in tri)
         start, end = p[near], q[near]
@@ -82,7 +87,7 @@ def _cut_apart(verts: np.ndarray, one: np.ndarray, two: np.ndarray) -> np.ndarra
     hit = np.zeros(len(one), bool)
     possible = np.arange(len(one))
     for x, y in ((a, b), (b, a)):  # all of one strictly on one side of the other
-        sides = np.stack([orient3d(*(t[possible] for t in y), x[k][possible]) for k in range(3)], 1)
+        sides = np.stack([_side([t[possible] for t in y], x[k][possible]) for k in range(3)], 1)
         possible = possible[~((sides > 0).all(1) | (sides < 0).all(1))]
     for x, y in ((a, b), (b, a)):
         for k in range(3):
@@ -98,8 +103,8 @@ def _cut_at_vertex(verts: np.ndarray, one: np.ndarray, two: np.ndarray) -> np.nd
     possible = np.arange(len(one))
     for x, y in ((one, two), (two, one)):  # the far edge strictly on one side: only the vertex
         tri = list(np.moveaxis(verts[y[possible]], 1, 0))
-        sides = [orient3d(*tri, verts[x[possible, k]]) for k in (1, 2)]
-        possible = possible[sides[0].astype(int) * sides[1] <= 0]
+        sides = [_side(tri, verts[x[possible, k]]) for k in (1, 2)]
+        possible = possible[sides[0] * sides[1] <= 0]
     for x, y in ((one, two), (two, one)):
         rest = possible[~hit[possible]]
         tri = list(np.moveaxis(verts[y[rest]], 1, 0))
@@ -111,7 +116,7 @@ def _folded(verts: np.ndarray, one: np.ndarray, two: np.ndarray, other: np.ndarr
     """Faces with a common edge, whose far vertex comes first: are they folded onto each other?"""
     tri = list(np.moveaxis(verts[one], 1, 0))
     point = verts[np.take_along_axis(two, other[:, None], 1)[:, 0]]
-    hit = orient3d(*tri, point) == 0
+    hit = _side(tri, point) == 0
     if hit.any():
         a, b, c = (x[hit] for x in tri)
         axis = np.abs(np.cross(b - a, c - a)).argmax(1)

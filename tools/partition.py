@@ -8,16 +8,16 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from monopart.geometry.alignment import Similarity, align
+from monopart.geometry.alignment import Similarity
 from monopart.geometry.atomic import write_bytes, write_json
+from monopart.geometry.bone_heat import heat_weights
 from monopart.geometry.errors import InputError
 from monopart.geometry.geodesics import PartBands, part_bands
-from monopart.geometry.heat_weights import heat_weights
 from monopart.geometry.joint_names import joint_names
 from monopart.geometry.mesh_graph import MeshGraph, components, face_graph
 from monopart.geometry.part_cleaning import clean_face_labels, label_shares, vertex_labels
@@ -32,6 +32,7 @@ from monopart.geometry.weight_transfer import transfer_rows
 from .images import encoded
 from .meshio import Mesh, Skeleton, read_mesh
 from .pictures import front_and_back, part_colors
+from .templates import fitted_person
 
 Method = Literal["auto", "weights", "heat", "transfer"]
 _FAR = 0.06  # a body surface farther away gives no weights, in diagonals of the body
@@ -156,9 +157,9 @@ def weights_of(
             f"method: expected auto, weights, heat or transfer, found {method!r}; choose one"
         )
     body = default_body()
-    moved = align((mesh.verts, mesh.faces), (body.verts, body.faces))
-    size = float(np.linalg.norm(np.ptp(body.verts, axis=0)))
-    source = _rows(body), (body.verts, body.faces)
+    posed, moved = fitted_person(body, mesh.verts, mesh.faces)
+    size = float(np.linalg.norm(np.ptp(posed, axis=0)))
+    source = _rows(body), (posed, body.faces)
     rows, _ = transfer_rows(*source, (moved(mesh.verts), mesh.faces), _FAR * size)
     return rows, body.skeleton, chosen, moved
 
@@ -336,7 +337,7 @@ def write_partition(
     import io
 
     place = Path(folder)
-    arrays = {
+    arrays: dict[str, Any] = {
         "names": np.array(parts.names),
         "face_part": parts.face_part,
         "vertex_part": parts.vertex_part,

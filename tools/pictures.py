@@ -83,7 +83,7 @@ def view(
     >>> view(np.eye(3), np.array([[0, 1, 2]]), np.ones((1, 3)), height=40).shape
     (40, 40, 3)
     """
-    keep = np.isfinite(verts).all(1)[faces].all(1)
+    keep = np.asarray(np.isfinite(verts).all(axis=1))[faces].all(axis=1)
     faces, colors = faces[keep], colors[keep]
     if not len(faces):
         return np.full((height, height // 2, 3), _GROUND)

@@ -74,7 +74,9 @@ def test_a_coarse_body_moves_as_the_fine_one(num_faces: int, tmp_path) -> None:
     assert report["turned_edges"].count == report["weights_sum"].count == 0
     uv = body.uv.corner_uv
     assert 0 <= uv.min() and uv.max() <= 1
-    assert stretch(body).max() < 1.5 * stretch(full).max()  # no face is smeared over the texture
+    ours, theirs = stretch(body).flatten(), stretch(full).flatten()
+    assert ours.quantile(0.99) < 2 * theirs.quantile(0.99)
+    assert ours.max() < 3 * theirs.max()  # no face is smeared over the texture
 
 
 def stretch(body: BodyModel) -> torch.Tensor:

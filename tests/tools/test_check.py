@@ -9,7 +9,7 @@ import pytest
 from sample_meshes import changed, cube, joined, rigged, sample_meshes, shifted, sphere, torus
 
 from monopart.geometry.atomic import write_json
-from monopart.tools.check import check_mesh
+from monopart.tools.check import check_mesh, check_picture
 from monopart.tools.meshio import Mesh
 from monopart.tools.topology import topology
 
@@ -149,3 +149,15 @@ def test_a_check_needs_no_torch() -> None:
 def test_a_mesh_of_one_joint_and_no_skeleton() -> None:
     mesh = Mesh(np.eye(3), np.array([[0, 1, 2]]), weights=np.ones((3, 1)))
     assert check_mesh(mesh).ok
+
+
+def test_faulty_faces_are_red_in_the_picture() -> None:
+    for name, count in (("sphere", 0), ("turned face", 4), ("bad weights", 168), ("pinched", 10)):
+        mesh = sample_meshes()[name]
+        report = check_mesh(mesh)
+        assert report.faulty is not None and report.faulty.sum() == count, name
+        image = check_picture(mesh, report, 80)
+        red = (image[:80, :, 0] > 2 * image[:80, :, 1]).any()
+        assert red == (count > 0), name
+    for mesh in sample_meshes().values():
+        assert check_picture(mesh, check_mesh(mesh, intersections=False), 30).shape[2] == 3

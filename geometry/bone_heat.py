@@ -112,8 +112,8 @@ def _sees(verts: np.ndarray, faces: np.ndarray, start: np.ndarray, end: np.ndarr
         return np.zeros(0, bool)
     share = np.array(_SEEN)[:, None, None]
     on_the_way = ((1 - share) * start + share * end).reshape(-1, 3)
-    winding = igl.fast_winding_number(verts, faces, np.ascontiguousarray(on_the_way))
-    return (winding.reshape(len(_SEEN), -1) > 0.5).all(0)
+    winding = np.asarray(igl.fast_winding_number(verts, faces, np.ascontiguousarray(on_the_way)))
+    return np.asarray((winding.reshape(len(_SEEN), -1) > 0.5).all(axis=0))
 
 
 def nearest_bones(

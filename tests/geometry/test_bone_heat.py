@@ -11,14 +11,14 @@ from sample_meshes import cube, grid, joined, rigged, shifted, sphere
 
 from monopart.geometry.alignment import align, fitted_similarity, surface_points
 from monopart.geometry.body import BodyModel, BodyPose
-from monopart.geometry.errors import InputError
-from monopart.geometry.heat_weights import (
+from monopart.geometry.bone_heat import (
     bones_of_joints,
     heat_weights,
     nearest_bones,
     solved_rows,
     surface_laplacian,
 )
+from monopart.geometry.errors import InputError
 from monopart.geometry.parts import PartMap
 from monopart.geometry.surface import closest_point
 from monopart.geometry.weight_transfer import (
