@@ -1,6 +1,6 @@
 """Packing of charts into the unit square: turned, rasterised, put where they touch the most."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from .errors import InputError
 
 _TURNS = 16
-_COARSE, _FINE = 96, 512
+_COARSE, _FINE = 128, 384
 _TRIALS = 30
 
 
@@ -149,6 +149,8 @@ class _Recipe:
     """How much a place near the lower left corner is worth against contact."""
     turns: np.ndarray | None = None
     """The one turn that each chart may have, or None for all."""
+    goals: np.ndarray | None = None
+    """Where the origin of each chart should lie, in the unit square; contact counts if None."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +205,10 @@ class _Board:
             hits = ifft2(fft2(taken.astype(np.complex64)) * self.spectra[chart])
             best, found = -8.0, None
             for which, stamp in enumerate(stamps):
-                value = _worth(hits[which], stamp, width, recipe.bias)
+                if recipe.goals is None:
+                    value = _worth(hits[which], stamp, width, recipe.bias)
+                else:
+                    value = _nearness(hits[which], stamp, width, recipe.goals[chart])
                 at = int(value.argmax()) if value.size else -1
                 if at >= 0 and value.flat[at] > best + 1e-4:
                     best, found = float(value.flat[at]), (which, *divmod(at, value.shape[1]))
@@ -214,6 +219,16 @@ class _Board:
             taken[row : row + mask.shape[0], column : column + mask.shape[1]] |= mask
             places[chart] = (int(which), int(row), int(column))
         return places
+
+
+    def origins(self, places: list[tuple[int, int, int]]) -> np.ndarray:
+        """Where the origin of each chart lies, in cells."""
+        return np.array(
+            [
+                np.array([column, row]) - self.stamps[chart][which].low
+                for chart, (which, row, column) in enumerate(places)
+            ]
+        )
 
 
 def _spectra(stamps: list[Stamp], canvas: int) -> np.ndarray:
@@ -241,6 +256,18 @@ def _worth(hits: np.ndarray, stamp: Stamp, width: int, bias: float) -> np.ndarra
     return np.where(hits.real < 0.5, contact, np.float32(-9.0))
 
 
+def _nearness(hits: np.ndarray, stamp: Stamp, width: int, goal: np.ndarray) -> np.ndarray:
+    """Value of each place of a stamp: the nearer to a goal the better, −9 where it does not fit."""
+    height, wide = stamp.mask.shape
+    if max(height, wide) > width:
+        return np.zeros((0, 0))
+    hits = hits[: width - height + 1, : width - wide + 1]
+    column, row = goal * width + stamp.low
+    away = np.hypot(np.arange(len(hits))[:, None] - row, np.arange(hits.shape[1])[None] - column)
+    contact = -hits.imag / stamp.rim.sum()
+    return np.where(hits.real < 0.5, 0.3 * contact - 4 * away / width, -9.0)
+
+
 def _round_up(number: int) -> int:
     from scipy.fft import next_fast_len
 
@@ -264,7 +291,8 @@ def _searched(board: _Board, sizes: np.ndarray) -> tuple[int, _Recipe]:
             continue
         while places is not None:
             turns = np.array([_turn_number(board, c, p[0]) for c, p in enumerate(places)])
-            best = (width, _Recipe(order, recipe.bias, turns))
+            goals = board.origins(places) / width
+            best = (width, _Recipe(order, recipe.bias, turns, goals))
             width -= max(1, width // 100)
             places = board.placed(recipe, width)
     if best is None:
@@ -278,26 +306,23 @@ def _turn_number(board: _Board, chart: int, which: int) -> int:
 
 
 def _tightest(board: _Board, recipe: _Recipe, width: int) -> Packing:
-    """The narrowest square on a fine grid, from a first guess."""
+    """The narrowest square on a fine grid: charts move together from where they lie."""
     places = None
     while places is None:
-        if width > board.canvas:
+        while width > board.canvas:
             board = board.widened()
-        places = board.placed(recipe, min(width, board.canvas))
-        if places is None:
-            width += max(1, width // 100)
-    best, failed = (width, places), 0
-    while failed < 3:
-        width -= 1 if failed else max(1, width // 150)
         places = board.placed(recipe, width)
         if places is None:
-            failed += 1
+            width += max(1, width // 100)
+    best, step = (width, places), max(1, width // 64)
+    while step:
+        # each step starts from the last good places, pulled together
+        goals = board.origins(best[1]) / best[0]
+        places = board.placed(replace(recipe, goals=goals), best[0] - step)
+        if places is None:
+            step //= 2
         else:
-            best, failed = (width, places), 0
+            best = (best[0] - step, places)
     width, places = best
-    turn, shift = np.zeros((len(places), 2, 2)), np.zeros((len(places), 2))
-    for chart, (which, row, column) in enumerate(places):
-        stamp = board.stamps[chart][which]
-        turn[chart] = stamp.turn
-        shift[chart] = (np.array([column, row]) - stamp.low) / width
-    return Packing(board.unit / width, turn, shift)
+    turn = np.stack([board.stamps[chart][which].turn for chart, (which, _, _) in enumerate(places)])
+    return Packing(board.unit / width, turn, board.origins(places) / width)
