@@ -123,16 +123,14 @@ class _Reader:
             raise self.short(element)
         if element.count == 0 or not element.properties:
             return {p.name: self.none(p) for p in element.properties}
-        if not element.has_lists:
-            return self.table(element, [0] * len(element.properties))
         sizes = self.first_sizes(element)
         try:
             table = self.table(element, sizes)
         except InputError:  # longer than the file: later lists may be shorter than the first
+            if not element.has_lists:
+                raise
             table = None
-        if table is not None:
-            return table
-        return self.rows(element)
+        return self.rows(element) if table is None else table
 
     def none(self, what: _Property) -> np.ndarray | Lists:
         empty = np.zeros(0, dtype=what.kind)
@@ -150,7 +148,7 @@ class _Reader:
     def first_sizes(self, element: _Element) -> list[int]:
         raise AttributeError
 
-    def table(self, element: _Element, sizes: list[int]) -> dict[str, Any]:
+    def table(self, element: _Element, sizes: list[int]) -> dict[str, Any] | None:
         raise AttributeError
 
     def rows(self, element: _Element) -> dict[str, np.ndarray | Lists]:

@@ -91,8 +91,9 @@ def isotropic(
     def work(meshes: Any, size: float) -> None:
         import pymeshlab
 
+        lab: Any = pymeshlab  # its names are made when it is loaded
         meshes.meshing_isotropic_explicit_remeshing(
-            iterations=iterations, targetlen=pymeshlab.PureValue(edge_length / size)
+            iterations=iterations, targetlen=lab.PureValue(edge_length / size)
         )
 
     return _remeshed(mesh, work, progress, "isotropic")
@@ -148,12 +149,12 @@ def without_broken(mesh: Mesh) -> tuple[Mesh, int]:
     Returns:
         The rest, and the number of vertices that were taken out.
     """
-    good = np.isfinite(mesh.verts).all(axis=1)
+    good: np.ndarray = np.isfinite(mesh.verts).all(axis=1)
     if mesh.weights is not None:
-        good &= np.isfinite(mesh.weights).all(axis=1)
+        good = good & np.isfinite(mesh.weights).all(axis=1)
     if good.all():
         return mesh, 0
-    kept = good[mesh.faces].all(axis=1)
+    kept: np.ndarray = good[mesh.faces].all(axis=1)
     place = np.cumsum(good) - 1
 
     def rows(values: np.ndarray | None, which: np.ndarray) -> np.ndarray | None:
@@ -177,18 +178,19 @@ def _remeshed(
 ) -> Remeshed:
     import pymeshlab
 
+    lab: Any = pymeshlab  # its names are made when it is loaded
     progress(0.05, "remeshing")
     # in a box of about 1: some limits of PyMeshLab are absolute, and some of it is float32
     low, diagonal = _box(mesh)
     size = 2.0 ** np.ceil(np.log2(diagonal))  # a power of two changes no digit
-    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes = lab.MeshSet(verbose=False)
     try:
-        meshes.add_mesh(pymeshlab.Mesh((mesh.verts - low) / size, mesh.faces))
+        meshes.add_mesh(lab.Mesh((mesh.verts - low) / size, mesh.faces))
         work(meshes, size)
         result = meshes.current_mesh()
         verts = np.asarray(result.vertex_matrix(), dtype=np.float64) * size + low
         faces = np.asarray(result.face_matrix(), dtype=np.int64).reshape(-1, 3)
-    except pymeshlab.PyMeshLabException as error:
+    except lab.PyMeshLabException as error:
         raise InputError(
             f"{mesh.name}: expected a surface that PyMeshLab can {method}, found one that it "
             f"refuses ({error}); clean it first"

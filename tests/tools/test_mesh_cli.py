@@ -311,6 +311,38 @@ def test_unwrap_writes_a_layout(tmp_path, capsys):
     assert "target" in words
 
 
+NO_TORCH = """
+import sys
+from pathlib import Path
+for name in ("torch", "warp", "trimesh", "kornia", "cv2", "tyro"):
+    sys.modules[name] = None  # any import of it now raises
+from monopart.tools.cli import main
+folder = Path(sys.argv[1])
+source = str(folder / "in.glb")
+for n, argv in enumerate((
+    ["convert", source, "-o", "0.ply"],
+    ["check", source, "-o", "1.json"],
+    ["partition", source, "-o", "2.glb", "--parts", "single"],
+    ["bake", "weights", source, source, "-o", "3.glb"],
+    ["bake", "distance", source, "-o", "4.npz", "--unsigned", "--spacing", "0.1"],
+    ["remesh", source, "-o", "5.glb", "--clean"],
+)):
+    argv[argv.index("-o") + 1] = str(folder / argv[argv.index("-o") + 1])
+    print(argv[0], main([*argv, "--no-picture"]))
+"""
+
+
+@pytest.mark.slow
+def test_only_unwrap_and_body_need_torch(tmp_path):
+    pytest.importorskip("pymeshlab")
+    write_mesh(tmp_path / "in.glb", tube())
+    argv = [sys.executable, "-c", NO_TORCH, str(tmp_path)]
+    done = subprocess.run(argv, capture_output=True, text=True, check=False)
+    assert not done.stderr
+    codes = [line for line in done.stdout.splitlines() if line.split()[0] in cli.COMMANDS]
+    assert [line.split()[1] for line in codes] == ["0", "1", "0", "0", "0", "0"], done.stdout
+
+
 def test_a_library_that_fails_is_one_line(tmp_path, capsys, monkeypatch):
     write_mesh(tmp_path / "in.obj", cube())
 
