@@ -149,12 +149,12 @@ def without_broken(mesh: Mesh) -> tuple[Mesh, int]:
     Returns:
         The rest, and the number of vertices that were taken out.
     """
-    good: np.ndarray = np.isfinite(mesh.verts).all(axis=1)
+    good = np.asarray(np.isfinite(mesh.verts).all(axis=1))
     if mesh.weights is not None:
         good = good & np.isfinite(mesh.weights).all(axis=1)
     if good.all():
         return mesh, 0
-    kept: np.ndarray = good[mesh.faces].all(axis=1)
+    kept = np.asarray(good[mesh.faces].all(axis=1))
     place = np.cumsum(good) - 1
 
     def rows(values: np.ndarray | None, which: np.ndarray) -> np.ndarray | None:
