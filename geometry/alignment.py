@@ -139,8 +139,8 @@ def iterated(
         The similarity after the last step.
 
     >>> start = Similarity(1.0, np.eye(3), np.array([0.1, 0, 0]))
-    >>> iterated(start, np.eye(3), np.eye(3), 5).shift.round(6).tolist()
-    [0.0, 0.0, 0.0]
+    >>> bool(abs(iterated(start, np.eye(3), np.eye(3), 5).shift).max() < 1e-6)
+    True
     """
     from scipy.spatial import KDTree
 
