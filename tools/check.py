@@ -129,7 +129,7 @@ class _Checker:
         if "faces" in of:
             self.faulty[rows] = True
         elif rows.ndim == 1:
-            self.faulty |= np.isin(self.faces, rows).any(axis=1)
+            self.faulty |= np.isin(self.welded[self.faces], self.welded[rows]).any(axis=1)
         else:
             ends = np.sort(self.welded[self.faces][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
             both = np.unique(np.concatenate([rows, ends]), axis=0, return_inverse=True)[1].reshape(

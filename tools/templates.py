@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
-from monopart.geometry.alignment import Similarity, align, iterated, surface_points
+from monopart.geometry.alignment import Similarity, align_to_best, iterated, surface_points
 
 from .meshio import Mesh, Skeleton
 
@@ -97,11 +97,9 @@ def fitted_person(
     Raises:
         InputError: an empty or damaged mesh, or one without area.
     """
-    tries = []
-    for arms in _ARMS:
-        posed = person(body, arms)
-        tries.append((align((verts, faces), (posed, body.faces)), arms))
-    found, arms = min(tries, key=lambda pair: pair[0].residual)
+    poses = [(person(body, arms), body.faces) for arms in _ARMS]
+    first, found = align_to_best((verts, faces), poses)
+    arms = _ARMS[first]
     points = surface_points(verts, faces, _POINTS)
     angles, best = np.array([arms, 0.0]), math.inf
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_meshes import cube, grid, joined, rigged, shifted, sphere
 
-from monopart.geometry.alignment import align, fitted_similarity, surface_points
+from monopart.geometry.alignment import align, align_to_best, fitted_similarity, surface_points
 from monopart.geometry.body import BodyModel, BodyPose
 from monopart.geometry.bone_heat import (
     bones_of_joints,
@@ -245,5 +245,7 @@ def test_similarities_by_hand() -> None:
     assert np.abs(np.abs(spread).max(1) - 0.5).max() < 1e-12
     top = (spread[:, 1] == 0.5).mean()
     assert top == pytest.approx(1 / 6, abs=0.01)
+    with pytest.raises(InputError, match="targets"):
+        align_to_best((cube().verts, cube().faces), [])
     with pytest.raises(InputError, match="area"):
         surface_points(np.zeros((3, 3)), np.array([[0, 1, 2]]), 4)
