@@ -146,7 +146,7 @@ def _checked(options: UnwrapOptions) -> Any:
             f"{chosen['size']} and {chosen['margin']}; enlarge the texture"
         )
     if chosen["chart_share"] is None:
-        chosen["chart_share"] = min(1.0, 0.06 * float(np.sqrt((chosen["target"] - 4) / 0.03)))
+        chosen["chart_share"] = min(1.0, 0.06 * ((chosen["target"] - 4) / 0.03) ** 0.75)
     elif not 0 < chosen["chart_share"] <= 1:
         raise InputError(f"chart_share: expected a number in (0, 1], found {chosen['chart_share']}")
     return chosen

@@ -7,9 +7,9 @@ from jaxtyping import Bool, Float, Int
 
 from .errors import InputError
 
-_TURNS = 16
+_TURNS = 12
 _COARSE, _FINE = 128, 384
-_TRIALS = 30
+_TRIALS = 24
 
 
 @dataclass(frozen=True, eq=False)
