@@ -111,9 +111,7 @@ def unwrap(
     if chosen["engine"] == "xatlas":
         from .uv_xatlas import xatlas_layout
 
-        corner_uv, chart = xatlas_layout(
-            points, corners, labels, chosen["size"], chosen["margin"]
-        )
+        corner_uv, chart = xatlas_layout(points, corners, labels, chosen["size"], chosen["margin"])
     else:
         corner_uv, chart = _layout(points, corners, labels, chosen, progress)
     corner_uv = np.round(corner_uv / GRID) * GRID
@@ -208,6 +206,6 @@ def _layout(
         atlas = atlas_by_method(surface, seams, chosen["method"])
     tell("pack", 0.0)
     packing = packed(atlas.corner_uv, atlas.cut.chart, chosen["size"], chosen["margin"])
-    uv = packing.place(atlas.uv[:, None], atlas.cut.vert_chart)[:, 0]
+    uv = packing.place(atlas.uv, atlas.cut.vert_chart)
     tell("pack", 1.0)
     return uv[atlas.cut.faces], atlas.cut.chart

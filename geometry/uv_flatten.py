@@ -239,9 +239,7 @@ def _to_area(uv: np.ndarray, places: np.ndarray, faces: np.ndarray) -> np.ndarra
     return uv * np.sqrt(wanted / got) if got > 0 else uv
 
 
-def flipped_charts(
-    cut: CutMesh, uv: Float[np.ndarray, "W 2"]
-) -> Int[np.ndarray, "n"]:
+def flipped_charts(cut: CutMesh, uv: Float[np.ndarray, "W 2"]) -> Int[np.ndarray, "n"]:
     """Charts that hold a face of no or negative area.
 
     Args:

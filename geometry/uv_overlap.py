@@ -134,7 +134,9 @@ def _close_boxes(boxes: Float[np.ndarray, "n 4"]) -> "list[tuple[np.ndarray, np.
         i = np.repeat(np.arange(start, stop), count)
         j = i + 1 + np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count)
         a, b = owner[i], owner[j]
-        meet = (np.maximum(boxes[a, :2], boxes[b, :2]) < np.minimum(boxes[a, 2:], boxes[b, 2:])).all(1)
+        meet = (
+            np.maximum(boxes[a, :2], boxes[b, :2]) < np.minimum(boxes[a, 2:], boxes[b, 2:])
+        ).all(1)
         # a pair is looked at in the first cell that both boxes have
         once = (column[i] == np.maximum(first[a, 0], first[b, 0])) & (
             row[i] == np.maximum(first[a, 1], first[b, 1])

@@ -33,11 +33,11 @@ class Packing:
     shift: Float[np.ndarray, "C 2"]
 
     def place(
-        self, corner: Float[np.ndarray, "F 3 2"], chart: Int[np.ndarray, "F"]
-    ) -> Float[np.ndarray, "F 3 2"]:
-        """Coordinates in the unit square of the corners of charts in their own planes."""
-        turned = np.einsum("fij,fkj->fki", self.turn[chart], corner)
-        return self.scale * turned + self.shift[chart][:, None]
+        self, uv: Float[np.ndarray, "W 2"], chart: Int[np.ndarray, "W"]
+    ) -> Float[np.ndarray, "W 2"]:
+        """Coordinates in the unit square of points of charts in their own planes."""
+        turned = (self.turn[chart] * uv[:, None]).sum(-1)
+        return self.scale * turned + self.shift[chart]
 
 
 def packed(
@@ -121,7 +121,9 @@ def coverage(
     number = wide[:, 0] * wide[:, 1]
     face = np.repeat(np.arange(len(corner)), number)
     rank = np.arange(len(face)) - np.repeat(np.cumsum(number) - number, number)
-    cell = np.stack([first[face, 0] + rank % wide[face, 0], first[face, 1] + rank // wide[face, 0]], 1)
+    cell = np.stack(
+        [first[face, 0] + rank % wide[face, 0], first[face, 1] + rank // wide[face, 0]], 1
+    )
     middle = cell + 0.5
     side = np.roll(corner, -1, 1) - corner
     turned = np.sign(side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0])
@@ -187,7 +189,9 @@ class _Board:
     def widened(self) -> "_Board":
         """The same with more room."""
         canvas = _round_up(int(1.3 * self.canvas))
-        return _Board(self.stamps, [_spectra(own, canvas) for own in self.stamps], self.unit, canvas)
+        return _Board(
+            self.stamps, [_spectra(own, canvas) for own in self.stamps], self.unit, canvas
+        )
 
     def placed(self, recipe: _Recipe, width: int) -> list[tuple[int, int, int]] | None:
         """Turn, row and column of each chart in a square of some cells; None if they do not fit."""
@@ -215,7 +219,6 @@ class _Board:
             taken[row : row + mask.shape[0], column : column + mask.shape[1]] |= mask
             places[chart] = (int(which), int(row), int(column))
         return places
-
 
     def origins(self, places: list[tuple[int, int, int]]) -> np.ndarray:
         """Where the origin of each chart lies, in cells."""

@@ -91,7 +91,12 @@ def _best(moves: list[Move], atlas: Atlas, target: float) -> list[Move]:
     for i in order:
         move = moves[i]
         best = moves[order[0]].gain / moves[order[0]].price
-        if move.gain <= 0 or len(move.edges) == 0 or surplus <= 0 or move.gain / move.price < 0.4 * best:
+        if (
+            move.gain <= 0
+            or len(move.edges) == 0
+            or surplus <= 0
+            or move.gain / move.price < 0.4 * best
+        ):
             break
         chosen.append(move)
         surplus -= move.gain
@@ -123,9 +128,7 @@ def _moves(atlas: Atlas, target: float, known: dict[tuple[int, ...], Move]) -> l
     surplus = float(excess.sum() - (target - ISOMETRIC) * atlas.rest.area.sum())
     floor = min(0.3 * max(weight), 0.02 * surplus)
     units = [u for u, w in zip(units, weight, strict=True) if w >= floor]
-    keys = [
-        tuple(int(x) for c in u for x in (first[c], size[c], open_sides[c])) for u in units
-    ]
+    keys = [tuple(int(x) for c in u for x in (first[c], size[c], open_sides[c])) for u in units]
     fresh = [i for i, key in enumerate(keys) if key not in known]
     if fresh:
         for i, move in zip(fresh, _tried(atlas, [units[i] for i in fresh]), strict=True):

@@ -274,8 +274,12 @@ def _handles(surface: Surface, cut: CutMesh, bad: Bool[np.ndarray, "C"]) -> np.n
     from scipy.sparse.csgraph import minimum_spanning_tree
 
     edges, graph = surface.edges, surface.graph(cut)
-    closed = np.flatnonzero(bad & (np.bincount(cut.chart[_open_faces(cut)], minlength=len(bad)) == 0))
-    roots = np.concatenate([np.unique(cut.border), _first_of(cut.vert_chart, cut.num_charts)[closed]])
+    closed = np.flatnonzero(
+        bad & (np.bincount(cut.chart[_open_faces(cut)], minlength=len(bad)) == 0)
+    )
+    roots = np.concatenate(
+        [np.unique(cut.border), _first_of(cut.vert_chart, cut.num_charts)[closed]]
+    )
     distance, before = _shortest(graph, roots)
     inner = np.flatnonzero(~cut.seams)
     half = edges.sides[inner, 0]
