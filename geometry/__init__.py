@@ -1,9 +1,10 @@
 """Differentiable body geometry, importable alone.
 
 Every public name can be imported from here or from its room; the rooms load on first use, so
-importing this package costs nothing and has no effects. Two names are those of rooms and stay
-rooms here: take the functions with ``from monopart.geometry.rigid import rigid`` and
-``from monopart.geometry.skinning import unskin``.
+importing this package costs nothing and has no effects. Three names are those of rooms and stay
+rooms here: take the functions with ``from monopart.geometry.rigid import rigid``,
+``from monopart.geometry.skinning import unskin`` and
+``from monopart.geometry.unwrap import unwrap``.
 """
 
 if __name__ != "monopart.geometry":  # a bare import would copy every class
@@ -75,9 +76,20 @@ if TYPE_CHECKING:
     from .unskin import inverse_skin as inverse_skin
     from .unskin_roots import UnskinnedRoots as UnskinnedRoots
     from .unskin_roots import inverse_skin_all as inverse_skin_all
+    from .unwrap import UnwrapOptions as UnwrapOptions
+    from .unwrap import UVLayout as UVLayout
     from .uv import UVMap as UVMap
     from .weight_transfer import closest_faces as closest_faces
     from .weight_transfer import transfer_rows as transfer_rows
+    from .uv_lookup import UVHit as UVHit
+    from .uv_lookup import UVIndex as UVIndex
+    from .uv_lookup import transfer_uv as transfer_uv
+    from .uv_report import UVReport as UVReport
+    from .uv_report import uv_report as uv_report
+    from .uv_texture import TexelMap as TexelMap
+    from .uv_texture import fill_gutter as fill_gutter
+    from .uv_texture import sample_texture as sample_texture
+    from .uv_texture import texel_map as texel_map
 
 _ROOM = {
     "BackendError": "errors",
@@ -102,9 +114,15 @@ _ROOM = {
     "SkinWeights": "skinning",
     "SurfaceHit": "surface",
     "SurfaceIndex": "surface",
+    "TexelMap": "uv_texture",
+    "UVHit": "uv_lookup",
+    "UVIndex": "uv_lookup",
+    "UVLayout": "unwrap",
     "UVMap": "uv",
+    "UVReport": "uv_report",
     "Unskinned": "unskin",
     "UnskinnedRoots": "unskin_roots",
+    "UnwrapOptions": "unwrap",
     "align": "alignment",
     "axis_angle_to_rotmat": "rotations",
     "blend_skin": "skinning",
@@ -117,6 +135,7 @@ _ROOM = {
     "consistency_loss": "consistency",
     "convert_smplx_translation": "body",
     "face_graph": "mesh_graph",
+    "fill_gutter": "uv_texture",
     "forward_kinematics": "kinematics",
     "heat_weights": "bone_heat",
     "in_box": "boxes",
@@ -136,13 +155,17 @@ _ROOM = {
     "rotmat_to_axis_angle": "rotations",
     "rotmat_to_quat_wxyz": "rotations",
     "round_trip": "consistency",
+    "sample_texture": "uv_texture",
     "signed_distance": "surface",
     "skin": "skinning",
     "smooth_labels": "part_cleaning",
     "surface_distance": "geodesics",
     "table_by_name": "part_tables",
+    "texel_map": "uv_texture",
     "transfer_rows": "weight_transfer",
+    "transfer_uv": "uv_lookup",
     "transform_points": "rigid",
+    "uv_report": "uv_report",
     "vertex_graph": "mesh_graph",
     "vertex_normals": "surface",
 }

@@ -144,7 +144,7 @@ def _checked(options: UnwrapOptions) -> Any:
             f"{chosen['size']} and {chosen['margin']}; enlarge the texture"
         )
     if chosen["chart_share"] is None:
-        chosen["chart_share"] = min(1.0, 0.06 * float(np.sqrt((chosen["target"] - 4) / 0.03)))
+        chosen["chart_share"] = min(1.0, 0.06 * ((chosen["target"] - 4) / 0.03) ** 0.75)
     elif not 0 < chosen["chart_share"] <= 1:
         raise InputError(f"chart_share: expected a number in (0, 1], found {chosen['chart_share']}")
     return chosen
@@ -206,6 +206,6 @@ def _layout(
         atlas = atlas_by_method(surface, seams, chosen["method"])
     tell("pack", 0.0)
     packing = packed(atlas.corner_uv, atlas.cut.chart, chosen["size"], chosen["margin"])
-    uv = packing.place(atlas.uv[:, None], atlas.cut.vert_chart)[:, 0]
+    uv = packing.place(atlas.uv, atlas.cut.vert_chart)
     tell("pack", 1.0)
     return uv[atlas.cut.faces], atlas.cut.chart

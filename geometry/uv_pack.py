@@ -7,9 +7,9 @@ from jaxtyping import Bool, Float, Int
 
 from .errors import InputError
 
-_TURNS = 16
+_TURNS = 12
 _COARSE, _FINE = 128, 384
-_TRIALS = 30
+_TRIALS = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +33,11 @@ class Packing:
     shift: Float[np.ndarray, "C 2"]
 
     def place(
-        self, corner: Float[np.ndarray, "F 3 2"], chart: Int[np.ndarray, "F"]
-    ) -> Float[np.ndarray, "F 3 2"]:
-        """Coordinates in the unit square of the corners of charts in their own planes."""
-        turned = np.einsum("fij,fkj->fki", self.turn[chart], corner)
-        return self.scale * turned + self.shift[chart][:, None]
+        self, uv: Float[np.ndarray, "W 2"], chart: Int[np.ndarray, "W"]
+    ) -> Float[np.ndarray, "W 2"]:
+        """Coordinates in the unit square of points of charts in their own planes."""
+        turned = (self.turn[chart] * uv[:, None]).sum(-1)
+        return self.scale * turned + self.shift[chart]
 
 
 def packed(
@@ -219,7 +219,6 @@ class _Board:
             taken[row : row + mask.shape[0], column : column + mask.shape[1]] |= mask
             places[chart] = (int(which), int(row), int(column))
         return places
-
 
     def origins(self, places: list[tuple[int, int, int]]) -> np.ndarray:
         """Where the origin of each chart lies, in cells."""

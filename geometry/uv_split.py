@@ -79,17 +79,22 @@ def fiedler(
     from scipy.sparse import diags
 
     flat = flat_triangles(surface.verts, surface.faces)
+    # rounding leaves excess below zero, and a flat chart has none: a little of the area joins it
+    weight = np.maximum(weight, 0.0) + 1e-6 * (flat[:, 0, 0] * flat[:, 1, 1]) + 1e-30
     mass = np.bincount(cut.faces.reshape(-1), np.repeat(weight / 3, 3), minlength=len(cut.origin))
     matrix = laplacian(cut, flat, "cotangent")
-    total = np.bincount(cut.vert_chart, mass, minlength=cut.num_charts)
+    total = np.maximum(np.bincount(cut.vert_chart, mass, minlength=cut.num_charts), 1e-300)
     shift = 1e-4 * mass / total[cut.vert_chart]
-    factors = factorised((matrix + diags(shift)).tocsc())
+    # a chart without excess or area still needs a diagonal
+    scale = float(matrix.diagonal().mean())
+    factors = factorised((matrix + diags(shift + 1e-9 * max(scale, 1e-300))).tocsc())
 
     def unit(x: np.ndarray) -> np.ndarray:
         mean = np.bincount(cut.vert_chart, mass * x, minlength=len(total)) / total
         x = x - mean[cut.vert_chart]
         size = np.bincount(cut.vert_chart, mass * x * x, minlength=len(total)) / total
-        return x / np.sqrt(np.maximum(size, 1e-300))[cut.vert_chart]
+        x = np.divide(x, np.sqrt(size)[cut.vert_chart], out=x, where=size[cut.vert_chart] > 0)
+        return np.clip(x, -1e3, 1e3)
 
     x = unit(start)
     for _ in range(_POWER_STEPS):
