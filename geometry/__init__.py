@@ -1,9 +1,10 @@
 """Differentiable body geometry, importable alone.
 
 Every public name can be imported from here or from its room; the rooms load on first use, so
-importing this package costs nothing and has no effects. Two names are those of rooms and stay
-rooms here: take the functions with ``from monopart.geometry.rigid import rigid`` and
-``from monopart.geometry.skinning import unskin``.
+importing this package costs nothing and has no effects. Three names are those of rooms and stay
+rooms here: take the functions with ``from monopart.geometry.rigid import rigid``,
+``from monopart.geometry.skinning import unskin`` and
+``from monopart.geometry.unwrap import unwrap``.
 """
 
 if __name__ != "monopart.geometry":  # a bare import would copy every class
@@ -13,12 +14,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from .alignment import Similarity as Similarity
+    from .alignment import align as align
     from .body import BodyModel as BodyModel
     from .body import BodyPose as BodyPose
     from .body import PosedBody as PosedBody
     from .body import convert_smplx_translation as convert_smplx_translation
     from .body_io import read_body_arrays as read_body_arrays
     from .body_io import read_npy_object as read_npy_object
+    from .bone_heat import heat_weights as heat_weights
     from .boxes import box_mask as box_mask
     from .boxes import box_of as box_of
     from .boxes import in_box as in_box
@@ -44,9 +48,21 @@ if TYPE_CHECKING:
     from .errors import BackendError as BackendError
     from .errors import InputError as InputError
     from .errors import MonopartError as MonopartError
+    from .geodesics import PartBands as PartBands
+    from .geodesics import part_bands as part_bands
+    from .geodesics import surface_distance as surface_distance
     from .kinematics import KinematicTree as KinematicTree
     from .kinematics import forward_kinematics as forward_kinematics
+    from .mesh_graph import MeshGraph as MeshGraph
+    from .mesh_graph import face_graph as face_graph
+    from .mesh_graph import vertex_graph as vertex_graph
     from .moving_parts import MovingParts as MovingParts
+    from .part_cleaning import clean_face_labels as clean_face_labels
+    from .part_cleaning import remove_islands as remove_islands
+    from .part_cleaning import smooth_labels as smooth_labels
+    from .part_tables import preset_table as preset_table
+    from .part_tables import regions_by_name as regions_by_name
+    from .part_tables import table_by_name as table_by_name
     from .parts import PartMap as PartMap
     from .posed_parts import PartPairs as PartPairs
     from .posed_parts import PosedParts as PosedParts
@@ -71,7 +87,20 @@ if TYPE_CHECKING:
     from .unskin import inverse_skin as inverse_skin
     from .unskin_roots import UnskinnedRoots as UnskinnedRoots
     from .unskin_roots import inverse_skin_all as inverse_skin_all
+    from .unwrap import UnwrapOptions as UnwrapOptions
+    from .unwrap import UVLayout as UVLayout
     from .uv import UVMap as UVMap
+    from .uv_lookup import UVHit as UVHit
+    from .uv_lookup import UVIndex as UVIndex
+    from .uv_lookup import transfer_uv as transfer_uv
+    from .uv_report import UVReport as UVReport
+    from .uv_report import uv_report as uv_report
+    from .uv_texture import TexelMap as TexelMap
+    from .uv_texture import fill_gutter as fill_gutter
+    from .uv_texture import sample_texture as sample_texture
+    from .uv_texture import texel_map as texel_map
+    from .weight_transfer import closest_faces as closest_faces
+    from .weight_transfer import transfer_rows as transfer_rows
 
 _ROOM = {
     "BackendError": "errors",
@@ -83,8 +112,10 @@ _ROOM = {
     "DiffusedField": "diffused_weights",
     "InputError": "errors",
     "KinematicTree": "kinematics",
+    "MeshGraph": "mesh_graph",
     "MonopartError": "errors",
     "MovingParts": "moving_parts",
+    "PartBands": "geodesics",
     "PartMap": "parts",
     "PartPairs": "posed_parts",
     "PosedBody": "body",
@@ -93,12 +124,20 @@ _ROOM = {
     "Rays": "cameras",
     "RestPoints": "posed_parts",
     "ShellSamples": "culling",
+    "Similarity": "alignment",
     "SkinWeights": "skinning",
     "SurfaceHit": "surface",
     "SurfaceIndex": "surface",
+    "TexelMap": "uv_texture",
+    "UVHit": "uv_lookup",
+    "UVIndex": "uv_lookup",
+    "UVLayout": "unwrap",
     "UVMap": "uv",
+    "UVReport": "uv_report",
     "Unskinned": "unskin",
     "UnskinnedRoots": "unskin_roots",
+    "UnwrapOptions": "unwrap",
+    "align": "alignment",
     "axis_angle_to_rotmat": "rotations",
     "blend_cameras": "camera_paths",
     "blend_skin": "skinning",
@@ -111,27 +150,45 @@ _ROOM = {
     "camera_to_blender": "camera_conventions",
     "camera_to_opengl": "camera_conventions",
     "camera_to_pytorch3d": "camera_conventions",
+    "clean_face_labels": "part_cleaning",
+    "closest_faces": "weight_transfer",
     "closest_point": "surface",
     "consistency_loss": "consistency",
     "convert_smplx_translation": "body",
+    "face_graph": "mesh_graph",
+    "fill_gutter": "uv_texture",
     "forward_kinematics": "kinematics",
+    "heat_weights": "bone_heat",
     "in_box": "boxes",
     "inverse_skin": "unskin",
     "inverse_skin_all": "unskin_roots",
     "invert_affine": "rigid",
     "orbit_cameras": "camera_paths",
+    "part_bands": "geodesics",
+    "preset_table": "part_tables",
     "quat_wxyz_to_rotmat": "rotations",
     "ray_box": "boxes",
     "read_body_arrays": "body_io",
     "read_npy_object": "body_io",
     "ring_of_cameras": "camera_paths",
+    "regions_by_name": "part_tables",
+    "remove_islands": "part_cleaning",
     "rotation_angle": "rotations",
     "rotmat_to_axis_angle": "rotations",
     "rotmat_to_quat_wxyz": "rotations",
     "round_trip": "consistency",
+    "sample_texture": "uv_texture",
     "signed_distance": "surface",
     "skin": "skinning",
+    "smooth_labels": "part_cleaning",
+    "surface_distance": "geodesics",
+    "table_by_name": "part_tables",
+    "texel_map": "uv_texture",
+    "transfer_rows": "weight_transfer",
+    "transfer_uv": "uv_lookup",
     "transform_points": "rigid",
+    "uv_report": "uv_report",
+    "vertex_graph": "mesh_graph",
     "vertex_normals": "surface",
 }
 __all__ = list(_ROOM)  # pyright: ignore[reportUnsupportedDunderAll]

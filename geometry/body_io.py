@@ -12,19 +12,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .errors import InputError
+from .joint_names import joint_names
 from .kinematics import KinematicTree
 from .pickles import BAD_DATA, load_restricted
 
 WEIGHT_SUM_TOLERANCE = 1e-3
 """Rows of skinning weights whose sum is this near to 1 are scaled to 1; others are refused."""
-
-_SMPL_JOINTS = (
-    *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2"),
-    *("left_ankle", "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar"),
-    *("right_collar", "head", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow"),
-    *("left_wrist", "right_wrist", "left_hand", "right_hand"),
-)
-_NUM_SHARED_JOINTS = 22  # SMPL, SMPL-H and SMPL-X agree up to the wrists
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +137,7 @@ def check_body(raw: dict[str, np.ndarray], source: str) -> BodyArrays:
         shapedirs=shapedirs,
         posedirs=posedirs,
         corner_uv=file.corner_uv(len(faces)),
-        joint_names=_joint_names(num_joints),
+        joint_names=joint_names(num_joints),
     )
 
 
@@ -217,13 +210,6 @@ class _BodyFile:
             return None
         uv = self.floats(("vt",), (None, 2))
         return uv[self.indices(("ft",), (num_faces, 3), len(uv))]
-
-
-def _joint_names(num_joints: int) -> tuple[str, ...]:
-    if num_joints == len(_SMPL_JOINTS):
-        return _SMPL_JOINTS
-    shared = _SMPL_JOINTS[:_NUM_SHARED_JOINTS] if num_joints > len(_SMPL_JOINTS) else ()
-    return shared + tuple(f"joint_{j}" for j in range(len(shared), num_joints))
 
 
 def _open(path: str | os.PathLike[str]) -> io.BufferedReader:

@@ -1,65 +1,16 @@
 """Division of a body into parts, by the joint that moves each vertex most."""
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from .errors import InputError
-
-# Regions of the SMPL joints: every preset is a union of them
-_REGIONS: dict[str, tuple[int, ...]] = {
-    "torso": (0, 3, 6, 9, 13, 14),
-    "head": (12, 15),
-    "left_thigh": (1,),
-    "left_shin": (4, 7, 10),
-    "right_thigh": (2,),
-    "right_shin": (5, 8, 11),
-    "left_upper_arm": (16,),
-    "left_forearm": (18, 20),
-    "right_upper_arm": (17,),
-    "right_forearm": (19, 21),
-}
-# Joints beyond the wrists (index 22 on) by the number of joints: SMPL, SMPL-H, SMPL-X
-_EXTRA: dict[int, dict[str, tuple[int, ...]]] = {
-    22: {},
-    24: {"left_forearm": (22,), "right_forearm": (23,)},
-    52: {"left_forearm": tuple(range(22, 37)), "right_forearm": tuple(range(37, 52))},
-    55: {
-        "head": (22, 23, 24),
-        "left_forearm": tuple(range(25, 40)),
-        "right_forearm": tuple(range(40, 55)),
-    },
-}
-_LEFT_LEG, _RIGHT_LEG = ("left_thigh", "left_shin"), ("right_thigh", "right_shin")
-_LEFT_ARM = ("left_upper_arm", "left_forearm")
-_RIGHT_ARM = ("right_upper_arm", "right_forearm")
-_PRESETS: dict[str, dict[str, tuple[str, ...]]] = {
-    "five": {
-        "body": ("torso",),
-        "legs": _LEFT_LEG + _RIGHT_LEG,
-        "head": ("head",),
-        "left_arm": _LEFT_ARM,
-        "right_arm": _RIGHT_ARM,
-    },
-    "three": {
-        "body": ("torso", "head"),
-        "legs": _LEFT_LEG + _RIGHT_LEG,
-        "arms": _LEFT_ARM + _RIGHT_ARM,
-    },
-    "six": {
-        "body": ("torso",),
-        "left_leg": _LEFT_LEG,
-        "right_leg": _RIGHT_LEG,
-        "head": ("head",),
-        "left_arm": _LEFT_ARM,
-        "right_arm": _RIGHT_ARM,
-    },
-    "per_limb": {region: (region,) for region in _REGIONS},
-}
+from .part_tables import joint_parts, pieces_of_joints, preset_table, table_by_name
 
 
 @dataclass(frozen=True)
@@ -100,7 +51,8 @@ class PartMap:
         """A division by its name.
 
         Args:
-            name: "five", "three", "six" (legs apart), "per_limb" (limb segments apart) or "single".
+            name: "five", "three", "six" (legs apart), "per_limb" (limb segments apart), any of them
+                with "+hands" behind it (each hand a part of its own), or "single".
             num_joints: 24 (SMPL), 22, 52 (SMPL-H) or 55 (SMPL-X); any for "single".
 
         Raises:
@@ -109,28 +61,27 @@ class PartMap:
         >>> PartMap.preset("single", 3).joint_part
         (0, 0, 0)
         """
-        if name == "single":
-            return cls((0,) * num_joints, ("whole",))
-        if name not in _PRESETS:
-            known = ", ".join((*_PRESETS, "single"))
-            raise InputError(f"parts: expected one of {known}, found {name!r}; choose one of them")
-        if num_joints not in _EXTRA:
-            raise InputError(
-                f"parts: expected a body of {', '.join(map(str, _EXTRA))} joints for {name!r}, "
-                f"found {num_joints}; use 'single' or PartMap.from_table"
-            )
-        table = {
-            part: tuple(
-                joint
-                for region in regions
-                for joint in _REGIONS[region] + _EXTRA[num_joints].get(region, ())
-            )
-            for part, regions in _PRESETS[name].items()
-        }
-        return cls.from_table(table, num_joints)
+        return cls.from_table(preset_table(name, num_joints), num_joints)
 
     @classmethod
-    def from_table(cls, table: Mapping[str, tuple[int, ...]], num_joints: int) -> "PartMap":
+    def by_name(cls, preset: str, names: Sequence[str], parents: Sequence[int]) -> "PartMap":
+        """A preset for any skeleton whose joints are named for the body (Mixamo and the like).
+
+        Args:
+            preset: as in `preset`.
+            names: names of the joints.
+            parents: parent of each joint, -1 for a root; parents come before children.
+
+        Raises:
+            InputError: unknown preset, or no joint was recognised for one of its parts.
+
+        >>> PartMap.by_name("three", ["Hips", "LeftLeg", "RightArm"], [-1, 0, 0]).joint_part
+        (0, 1, 2)
+        """
+        return cls.from_table(table_by_name(preset, names, parents), len(names))
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Sequence[int]], num_joints: int) -> "PartMap":
         """A division given as the joints of each named part.
 
         Args:
@@ -143,14 +94,7 @@ class PartMap:
         >>> PartMap.from_table({"a": (0, 2), "b": (1,)}, 3).joint_part
         (0, 1, 0)
         """
-        listed = sorted(joint for joints in table.values() for joint in joints)
-        if listed != list(range(num_joints)):
-            raise InputError(
-                f"parts: expected each joint 0..{num_joints - 1} in exactly one part, "
-                f"found {listed}; correct the table"
-            )
-        part_of = {joint: part for part, joints in enumerate(table.values()) for joint in joints}
-        return cls(tuple(part_of[joint] for joint in range(num_joints)), tuple(table))
+        return cls(joint_parts(table, num_joints), tuple(table))
 
     @property
     def num_parts(self) -> int:
@@ -202,6 +146,56 @@ class PartMap:
         share = (weights @ one_hot)[faces].sum(1)
         # votes are whole numbers and shares of weight are scaled below 1, so they only break ties
         return (votes.sum(1) + share / (2 * share.sum(-1, keepdim=True))).argmax(-1)
+
+    def clean(
+        self,
+        weights: Float[Tensor, "V J"],
+        verts: Float[Tensor, "V 3"],
+        faces: Int[Tensor, "F 3"],
+        parents: Sequence[int],
+        smoothing: float | None = None,
+    ) -> tuple[Int[Tensor, "F"], Int[Tensor, "V"]]:
+        """Parts without islands and with short borders, the same left and right.
+
+        Joints of a part that hang together in the skeleton keep one connected piece each: the legs
+        are two. Left and right are equal where the mesh is symmetric in x = 0.
+
+        Args:
+            weights: skinning weights, (V, J).
+            verts: rest vertices, metres, (V, 3); +x is the subject's left.
+            faces: vertex indices, (F, 3).
+            parents: parent of each joint, -1 for a root (`body.tree.parents`).
+            smoothing: width over which a border may move to become shorter, metres; None is a
+                hundredth of the diagonal of the mesh, 0 only removes islands.
+
+        Returns:
+            Part of each face (F) and of each vertex (V), int64; constants for autograd.
+
+        Raises:
+            InputError: numbers of joints do not agree, numbers are not finite, faces are missing.
+
+        >>> from monopart.geometry import BodyModel
+        >>> body = BodyModel.default()
+        >>> face, _ = PartMap.default().clean(
+        ...     body.weights, body.v_template, body.faces, body.tree.parents
+        ... )
+        >>> sorted(set(face.tolist()))
+        [0, 1, 2, 3, 4]
+        """
+        from .part_cleaning import clean_face_labels, label_shares, vertex_labels
+
+        def plain(tensor: Tensor) -> np.ndarray:
+            array = tensor.detach().cpu()
+            return (array.double() if array.is_floating_point() else array.long()).numpy()
+
+        piece, part = pieces_of_joints(self.joint_part, parents)
+        points, corners = plain(verts), plain(faces)
+        shares = label_shares(plain(weights), piece, len(part))[corners].mean(1)
+        label = clean_face_labels(shares, points, corners, smoothing)
+        vertex = vertex_labels(label, points, corners, len(part))
+        table = torch.tensor(part, device=weights.device)
+        rows = [torch.from_numpy(x).to(weights.device) for x in (label, vertex)]
+        return table[rows[0]], table[rows[1]]
 
     def _joint_part(self, weights: Tensor) -> Tensor:
         if weights.shape[-1] != len(self.joint_part):

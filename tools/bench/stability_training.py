@@ -229,7 +229,7 @@ def command(capture: Path, seeds: int, steps: int, into: Path | None) -> None:
     text = f"`{capture.name}`, preset `fast`, {steps} steps, {seeds} seeds a case.\n\n{table(rows)}"
     print(text)
     if into is not None and page is not None:
-        from monopart.toolkit.atomic import write_text
+        from monopart.geometry.atomic import write_text
 
         head, rest = page.split(BEGIN)
         write_text(into, f"{head}{BEGIN}\n\n{text}\n{END}{rest.split(END)[1]}")

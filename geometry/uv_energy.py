@@ -1,0 +1,154 @@
+"""Symmetric Dirichlet energy of flat triangles against their rest shape, and its Newton steps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+ISOMETRIC = 4.0
+"""The energy per area of a map that keeps all lengths; the least there is."""
+
+
+def flat_triangles(verts: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> np.ndarray:
+    """Every triangle laid into the plane with its own lengths.
+
+    Triangles without area get a little: each of their sides is lengthened until it is the
+    tenth of a thousandth of the longest one shorter than the other two together.
+
+    Args:
+        verts: vertices.
+        faces: vertex indices.
+
+    Returns:
+        The second and third corner of each triangle, as the columns of (F, 2, 2); the first
+        corner is the origin and the second lies on the u axis.
+
+    Reference:
+        Sharp and Crane 2020, intrinsic mollification, here per face.
+    """
+    corners = verts[faces]
+    sides = np.linalg.norm(np.roll(corners, -1, 1) - corners, axis=-1)  # 01, 12, 20
+    scale = np.maximum(sides.max(1, keepdims=True), 1e-12 * max(float(np.abs(verts).max()), 1e-30))
+    slack = sides.sum(1, keepdims=True) - 2 * sides.max(1, keepdims=True)
+    sides = sides + np.maximum(1e-4 * scale - slack, 0.0)
+    a, b, c = sides.T
+    x = (a * a + c * c - b * b) / (2 * a)
+    half = sides.sum(1) / 2
+    area = np.sqrt(np.maximum(half * (half - a) * (half - b) * (half - c), 0.0))
+    y = 2 * area / a
+    return np.stack([np.stack([a, x], -1), np.stack([np.zeros_like(a), y], -1)], 1)
+
+
+@dataclass(frozen=True, eq=False)
+class RestShape:
+    """Triangles at rest, ready to compare with flat ones."""
+
+    inverse: Float[np.ndarray, "F 2 2"]
+    """Inverse of the matrix of the two sides from the first corner."""
+    area: Float[np.ndarray, "F"]
+
+    @classmethod
+    def of(cls, verts: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> "RestShape":
+        """Rest shape of a mesh."""
+        flat = flat_triangles(verts, faces)
+        a, x, y = flat[:, 0, 0], flat[:, 0, 1], flat[:, 1, 1]
+        zero = np.zeros_like(a)
+        inverse = np.stack([np.stack([1 / a, -x / (a * y)], -1), np.stack([zero, 1 / y], -1)], 1)
+        return cls(inverse, a * y / 2)
+
+    def of_faces(self, faces: np.ndarray) -> "RestShape":
+        """The same for some faces."""
+        return RestShape(self.inverse[faces], self.area[faces])
+
+    def jacobians(self, corner_uv: Float[np.ndarray, "F 3 2"]) -> Float[np.ndarray, "F 2 2"]:
+        """Derivative of the map of each face from its rest plane to (u, v)."""
+        sides = (corner_uv[:, 1:] - corner_uv[:, :1]).transpose(0, 2, 1)
+        return sides @ self.inverse
+
+
+def singular_values(jacobian: Float[np.ndarray, "F 2 2"]) -> tuple[np.ndarray, np.ndarray]:
+    """Singular values of 2 × 2 matrices, the larger one first; the second carries the sign of det.
+
+    Args:
+        jacobian: matrices, (F, 2, 2).
+
+    Returns:
+        Two arrays (F,).
+
+    >>> [float(s[0]) for s in singular_values(np.diag([2.0, -3.0])[None])]
+    [3.0, -2.0]
+    """
+    a, b, c, d = jacobian.reshape(-1, 4).T
+    plus = np.hypot(a + d, c - b) / 2
+    minus = np.hypot(a - d, c + b) / 2
+    return plus + minus, plus - minus
+
+
+def face_energy(jacobian: Float[np.ndarray, "F 2 2"]) -> Float[np.ndarray, "F"]:
+    """Symmetric Dirichlet energy |J|² + |J⁻¹|² of each face; infinite where it is flipped.
+
+    Args:
+        jacobian: derivatives of the maps, (F, 2, 2).
+
+    Returns:
+        Energies per area, at least 4.
+
+    Reference:
+        Smith and Schaefer 2015, equation 2.
+    """
+    a, b, c, d = jacobian.reshape(-1, 4).T
+    det = a * d - b * c
+    safe = np.where(det > 0, det, 1.0)
+    square = a * a + b * b + c * c + d * d
+    return np.where(det > 0, square * (1 + 1 / (safe * safe)), np.inf)
+
+
+def newton_terms(
+    jacobian: Float[np.ndarray, "F 2 2"],
+) -> tuple[Float[np.ndarray, "F 2 2"], Float[np.ndarray, "F 4 4"]]:
+    """Gradient and positive part of the Hessian of the energy with respect to each Jacobian.
+
+    Args:
+        jacobian: derivatives of the maps, all of positive determinant.
+
+    Returns:
+        Gradients (F, 2, 2) and Hessians (F, 4, 4) over the entries row by row, positive
+        semi-definite.
+
+    Reference:
+        Smith, De Goes and Kim 2019, Analytic eigensystems for isotropic distortion energies.
+    """
+    a, b, c, d = jacobian.reshape(-1, 4).T
+    # J = U diag(s1, s2) Vᵀ by the angles of its conformal and anticonformal part
+    plus_angle, minus_angle = np.arctan2(c - b, a + d), np.arctan2(c + b, a - d)
+    s1, s2 = singular_values(jacobian)
+    left, right = (plus_angle + minus_angle) / 2, (minus_angle - plus_angle) / 2
+    u = _rotation(left)
+    v = _rotation(right)
+    d1, d2 = 2 * s1 - 2 / s1**3, 2 * s2 - 2 / s2**3
+    h11, h22 = 2 + 6 / s1**4, 2 + 6 / s2**4
+    total, product = s1 + s2, s1 * s2
+    # (d1 + d2) / (s1 + s2) and (d1 − d2) / (s1 − s2), without the division by a small number
+    twist = (d1 + d2) / total
+    flip = 2 + 2 * (s1 * s1 + product + s2 * s2) / product**3
+    gradient = np.einsum("fij,fj,fkj->fik", u, np.stack([d1, d2], -1), v)
+    basis = _basis(u, v)
+    values = np.stack([h11, h22, np.maximum(twist, 0.0), np.maximum(flip, 0.0)], -1)
+    return gradient, np.einsum("fki,fk,fkj->fij", basis, values, basis)
+
+
+def _rotation(angle: np.ndarray) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+
+
+def _basis(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Eigenmatrices of the Hessian as rows: two stretches, twist, flip; (F, 4, 4)."""
+    half = np.sqrt(0.5)
+    shapes = [
+        np.array([[1.0, 0.0], [0.0, 0.0]]),
+        np.array([[0.0, 0.0], [0.0, 1.0]]),
+        half * np.array([[0.0, -1.0], [1.0, 0.0]]),
+        half * np.array([[0.0, 1.0], [1.0, 0.0]]),
+    ]
+    return np.stack([(u @ s @ v.transpose(0, 2, 1)).reshape(-1, 4) for s in shapes], 1)

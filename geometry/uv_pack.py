@@ -1,0 +1,327 @@
+"""Packing of charts into the unit square: turned, rasterised, put where they touch the most."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .errors import InputError
+
+_TURNS = 12
+_COARSE, _FINE = 128, 384
+_TRIALS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Stamp:
+    """Cells that a turned chart covers with its margin, and those around them."""
+
+    turn: Float[np.ndarray, "2 2"]
+    """Rotation of the chart."""
+    low: Float[np.ndarray, "2"]
+    """What to take off the turned coordinates (in cells) to come to the cells of the mask."""
+    mask: Bool[np.ndarray, "h w"]
+    rim: Bool[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True, eq=False)
+class Packing:
+    """Where each chart lies: uv = scale · (turn · local) + shift."""
+
+    scale: float
+    turn: Float[np.ndarray, "C 2 2"]
+    shift: Float[np.ndarray, "C 2"]
+
+    def place(
+        self, uv: Float[np.ndarray, "W 2"], chart: Int[np.ndarray, "W"]
+    ) -> Float[np.ndarray, "W 2"]:
+        """Coordinates in the unit square of points of charts in their own planes."""
+        turned = (self.turn[chart] * uv[:, None]).sum(-1)
+        return self.scale * turned + self.shift[chart]
+
+
+def packed(
+    corner: Float[np.ndarray, "F 3 2"], chart: Int[np.ndarray, "F"], size: int, margin: float
+) -> Packing:
+    """Pack charts into the unit square at one common scale.
+
+    Many orders are tried on a coarse grid; the best one is repeated on a fine grid.
+
+    Args:
+        corner: coordinates per face corner, each chart in a plane of its own.
+        chart: of each face, all numbers from 0 in use.
+        size: texels along a side of the square.
+        margin: least distance between charts and to the border of the square, texels.
+
+    Returns:
+        The places; the same for the same input.
+    """
+    count = int(chart.max(initial=-1)) + 1
+    side = corner[:, 1:] - corner[:, :1]
+    area = np.abs(side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0]) / 2
+    sizes = np.bincount(chart, area, minlength=count)
+    faces = [corner[rows] for rows in _rows_of(chart, count)]
+    coarse = _Board.of(faces, sizes, _COARSE, margin * _COARSE / size, _TURNS)
+    width, recipe = _searched(coarse, sizes)
+    fine = int(np.clip(size // 2, 2 * _COARSE, _FINE))
+    board = _Board.of(faces, sizes, fine, margin * fine / size, _TURNS, recipe.turns)
+    return _tightest(board, recipe, int(width * fine / _COARSE) + 2)
+
+
+def _rows_of(chart: np.ndarray, count: int) -> list[np.ndarray]:
+    order = np.argsort(chart, kind="stable")
+    return np.split(order, np.searchsorted(chart[order], np.arange(1, count)))
+
+
+def _stamps(corner: np.ndarray, gap: float, turns: np.ndarray, count: int) -> list[Stamp]:
+    """A chart in some of so many turns; turn 0 has its long side level or upright."""
+    base = _level_angle(corner.reshape(-1, 2))
+    out = []
+    for k in turns:
+        angle = base + 2 * np.pi * k / count
+        cos, sin = np.cos(angle), np.sin(angle)
+        turn = np.array([[cos, -sin], [sin, cos]])
+        mask, low = coverage(corner @ turn.T, gap)
+        mask = np.pad(mask, 1)
+        near = mask.copy()
+        near[1:] |= mask[:-1]
+        near[:-1] |= mask[1:]
+        near[:, 1:] |= mask[:, :-1]
+        near[:, :-1] |= mask[:, 1:]
+        out.append(Stamp(turn, low - 1, mask, near & ~mask))
+    return out
+
+
+def _level_angle(points: np.ndarray) -> float:
+    """Turn that gives the points the smallest upright box, of 64 turns."""
+    angles = np.linspace(0, np.pi / 2, 64, endpoint=False)
+    axes = np.stack([np.cos(angles), np.sin(angles)])
+    along, across = points @ axes, points @ np.stack([-axes[1], axes[0]])
+    box = np.ptp(along, axis=0) * np.ptp(across, axis=0)
+    return -float(angles[int(box.argmin())])
+
+
+def coverage(
+    corner: Float[np.ndarray, "F 3 2"], gap: float
+) -> tuple[Bool[np.ndarray, "h w"], Float[np.ndarray, "2"]]:
+    """Cells of a unit grid that come nearer than a gap to some triangles; a few more at corners.
+
+    Args:
+        corner: corners of the triangles in cells, in any order of turn.
+        gap: distance, cells.
+
+    Returns:
+        The mask (rows are v) and the coordinates of its lower left corner.
+    """
+    low = np.floor(corner.min((0, 1)) - gap)
+    corner = corner - low
+    first = np.floor(corner.min(1) - gap).astype(np.int64)
+    last = np.floor(corner.max(1) + gap).astype(np.int64)
+    wide = last - first + 1
+    number = wide[:, 0] * wide[:, 1]
+    face = np.repeat(np.arange(len(corner)), number)
+    rank = np.arange(len(face)) - np.repeat(np.cumsum(number) - number, number)
+    cell = np.stack(
+        [first[face, 0] + rank % wide[face, 0], first[face, 1] + rank // wide[face, 0]], 1
+    )
+    middle = cell + 0.5
+    side = np.roll(corner, -1, 1) - corner
+    turned = np.sign(side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0])
+    inside = np.ones(len(face), bool)
+    for k in range(3):
+        normal = np.stack([-side[:, k, 1], side[:, k, 0]], 1) * turned[:, None]
+        length = np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
+        normal /= length[:, None]
+        reach = 0.5 * np.abs(normal).sum(1) + gap
+        offset = (normal * corner[:, k]).sum(1)
+        inside &= (normal[face] * middle).sum(1) - offset[face] >= -reach[face]
+    mask = np.zeros((int(last[:, 1].max()) + 1, int(last[:, 0].max()) + 1), bool)
+    mask[cell[inside, 1], cell[inside, 0]] = True
+    return mask, low
+
+
+@dataclass(frozen=True, eq=False)
+class _Recipe:
+    """How charts are put down one after the other."""
+
+    order: np.ndarray
+    bias: float
+    """How much a place near the lower left corner is worth against contact."""
+    turns: np.ndarray | None = None
+    """The one turn that each chart may have, or None for all."""
+    goals: np.ndarray | None = None
+    """Where the origin of each chart should lie, in the unit square; contact counts if None."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Board:
+    """All charts as stamps, and their spectra: where a stamp fits is a correlation."""
+
+    stamps: list[list[Stamp]]
+    spectra: list[np.ndarray]
+    unit: float
+    """Cells per unit of length."""
+    canvas: int
+
+    @classmethod
+    def of(
+        cls,
+        faces: list[np.ndarray],
+        sizes: np.ndarray,
+        grid: int,
+        gap: float,
+        count: int,
+        turns: np.ndarray | None = None,
+    ) -> "_Board":
+        # the charts cover about seven tenths of the cells
+        unit = grid * np.sqrt(0.7 / max(float(sizes.sum()), 1e-300))
+        every = np.arange(count)
+        small = every[:: max(1, count // 4)]
+        few = sizes < 0.004 * sizes.sum()
+        stamps = []
+        for chart, own in enumerate(faces):
+            some = (small if few[chart] else every) if turns is None else turns[chart : chart + 1]
+            stamps.append(_stamps(own * unit, gap / 2, some, count))
+        need = max(max(s.mask.shape) for own in stamps for s in own)
+        canvas = _round_up(max(int(1.25 * grid), need + 2))
+        return cls(stamps, [_spectra(own, canvas) for own in stamps], unit, canvas)
+
+    def widened(self) -> "_Board":
+        """The same with more room."""
+        canvas = _round_up(int(1.3 * self.canvas))
+        return _Board(
+            self.stamps, [_spectra(own, canvas) for own in self.stamps], self.unit, canvas
+        )
+
+    def placed(self, recipe: _Recipe, width: int) -> list[tuple[int, int, int]] | None:
+        """Turn, row and column of each chart in a square of some cells; None if they do not fit."""
+        from scipy.fft import fft2, ifft2
+
+        taken = np.ones((self.canvas, self.canvas), bool)
+        taken[1 : width - 1, 1 : width - 1] = False
+        places: list[tuple[int, int, int]] = [(0, 0, 0)] * len(self.stamps)
+        for chart in recipe.order:
+            stamps = self.stamps[chart]
+            hits = ifft2(fft2(taken.astype(np.complex64)) * self.spectra[chart])
+            best, found = -8.0, None
+            for which, stamp in enumerate(stamps):
+                if recipe.goals is None:
+                    value = _worth(hits[which], stamp, width, recipe.bias)
+                else:
+                    value = _nearness(hits[which], stamp, width, recipe.goals[chart])
+                at = int(value.argmax()) if value.size else -1
+                if at >= 0 and value.flat[at] > best + 1e-4:
+                    best, found = float(value.flat[at]), (which, *divmod(at, value.shape[1]))
+            if found is None:
+                return None
+            which, row, column = found
+            mask = stamps[which].mask
+            taken[row : row + mask.shape[0], column : column + mask.shape[1]] |= mask
+            places[chart] = (int(which), int(row), int(column))
+        return places
+
+    def origins(self, places: list[tuple[int, int, int]]) -> np.ndarray:
+        """Where the origin of each chart lies, in cells."""
+        return np.array(
+            [
+                np.array([column, row]) - self.stamps[chart][which].low
+                for chart, (which, row, column) in enumerate(places)
+            ]
+        )
+
+
+def _spectra(stamps: list[Stamp], canvas: int) -> np.ndarray:
+    from scipy.fft import fft2
+
+    both = np.zeros((len(stamps), canvas, canvas), np.complex64)
+    for own, stamp in zip(both, stamps, strict=True):
+        height, width = stamp.mask.shape
+        own[:height, :width] = stamp.mask + 1j * stamp.rim
+    return np.conj(fft2(both))
+
+
+def _worth(hits: np.ndarray, stamp: Stamp, width: int, bias: float) -> np.ndarray:
+    """Value of each place of a stamp: −9 where it does not fit."""
+    height, wide = stamp.mask.shape
+    if max(height, wide) > width:
+        return np.zeros((0, 0))
+    hits = hits[: width - height + 1, : width - wide + 1]
+    # conj(F(mask + i rim)) · F(taken) gives hits − i contacts
+    contact = -hits.imag / stamp.rim.sum()
+    if bias:
+        row, column = np.arange(hits.shape[0])[:, None], np.arange(hits.shape[1])[None]
+        far = np.maximum(row + height, column + wide) / width
+        contact = contact - np.float32(bias) * far.astype(np.float32)
+    return np.where(hits.real < 0.5, contact, np.float32(-9.0))
+
+
+def _nearness(hits: np.ndarray, stamp: Stamp, width: int, goal: np.ndarray) -> np.ndarray:
+    """Value of each place of a stamp: the nearer to a goal the better, −9 where it does not fit."""
+    height, wide = stamp.mask.shape
+    if max(height, wide) > width:
+        return np.zeros((0, 0))
+    hits = hits[: width - height + 1, : width - wide + 1]
+    column, row = goal * width + stamp.low
+    away = np.hypot(np.arange(len(hits))[:, None] - row, np.arange(hits.shape[1])[None] - column)
+    contact = -hits.imag / stamp.rim.sum()
+    return np.where(hits.real < 0.5, 0.3 * contact - 4 * away / width, -9.0)
+
+
+def _round_up(number: int) -> int:
+    from scipy.fft import next_fast_len
+
+    return int(next_fast_len(number))
+
+
+def _searched(board: _Board, sizes: np.ndarray) -> tuple[int, _Recipe]:
+    """The narrowest square found with many orders, and how to fill it."""
+    random = np.random.default_rng(0)
+    extent = np.array([max(own[0].mask.shape) for own in board.stamps], float)
+    best: tuple[int, _Recipe] | None = None
+    for trial in range(_TRIALS):
+        measure = sizes if trial % 2 else extent**2
+        noise = np.exp((0.0 if trial < 6 else 0.35) * random.standard_normal(len(sizes)))
+        order = np.argsort(-measure * noise, kind="stable")
+        recipe = _Recipe(order, (0.0, 0.3, 1.0)[trial // 2 % 3])
+        width = board.canvas if best is None else best[0] - 1
+        places = board.placed(recipe, width)
+        if places is None and best is None:
+            board = board.widened()
+            continue
+        while places is not None:
+            turns = np.array([_turn_number(board, c, p[0]) for c, p in enumerate(places)])
+            goals = board.origins(places) / width
+            best = (width, _Recipe(order, recipe.bias, turns, goals))
+            width -= max(1, width // 100)
+            places = board.placed(recipe, width)
+    if best is None:
+        raise InputError("charts: expected charts that fit a square, found none that do")
+    return best
+
+
+def _turn_number(board: _Board, chart: int, which: int) -> int:
+    count = len(board.stamps[chart])
+    return which * (_TURNS // count) if count < _TURNS else which
+
+
+def _tightest(board: _Board, recipe: _Recipe, width: int) -> Packing:
+    """The narrowest square on a fine grid: charts move together from where they lie."""
+    places = None
+    while places is None:
+        while width > board.canvas:
+            board = board.widened()
+        places = board.placed(recipe, width)
+        if places is None:
+            width += max(1, width // 100)
+    best, step = (width, places), max(1, width // 64)
+    while step:
+        # each step starts from the last good places, pulled together
+        goals = board.origins(best[1]) / best[0]
+        places = board.placed(replace(recipe, goals=goals), best[0] - step)
+        if places is None:
+            step //= 2
+        else:
+            best = (best[0] - step, places)
+    width, places = best
+    turn = np.stack([board.stamps[chart][which].turn for chart, (which, _, _) in enumerate(places)])
+    return Packing(board.unit / width, turn, board.origins(places) / width)

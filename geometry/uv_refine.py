@@ -1,0 +1,195 @@
+"""Which charts to slit and which to split: the largest gain for a seam and a chart comes first."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int
+
+from .uv_charts import Atlas, first_guess, halves
+from .uv_energy import ISOMETRIC
+from .uv_mirror import chart_mates, mirrored_edges, symmetric_edges
+from .uv_split import fiedler, separators, split_paths, tip_slits
+
+_ROUNDS = 80
+_TRIAL_STEPS = 12
+_FINAL_STEPS = 40
+_CHART_PRICE = 0.15
+"""What a chart costs, as a length of seam, in units of the square root of the area."""
+_SEAM_PRICE = 0.05
+"""What any seam costs, however short."""
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """A slit or a split of one chart, or of two that mirror each other, tried out."""
+
+    edges: Int[np.ndarray, "n"]
+    faces: Int[np.ndarray, "m"]
+    corner_uv: np.ndarray
+    """Coordinates of the corners of the faces after the move."""
+    gain: float
+    """Energy by which it falls."""
+    price: float
+
+
+def refined(
+    atlas: Atlas, target: float, max_charts: int | None, progress: Progress | None = None
+) -> Atlas:
+    """Slit and split the charts of most stretch until the mean energy is at the target.
+
+    Args:
+        atlas: the discs.
+        target: mean symmetric Dirichlet energy per area to reach, above 4.
+        max_charts: do not make more charts for the sake of the target.
+        progress: told the stage and the share that is done.
+
+    Returns:
+        Discs of at most the target energy, none of which lies on itself.
+    """
+    atlas = atlas.relaxed(_FINAL_STEPS)
+    atlas = _towards(atlas, target, max_charts, progress)
+    for _ in range(_ROUNDS):
+        pairs = atlas.overlaps()
+        if len(pairs) == 0:
+            break
+        atlas = _separated(atlas, pairs)
+    return atlas
+
+
+def _towards(
+    atlas: Atlas, target: float, max_charts: int | None, progress: Progress | None
+) -> Atlas:
+    known: dict[tuple[int, ...], Move] = {}
+    for _ in range(_ROUNDS):
+        energy = atlas.mean_energy
+        if progress is not None:
+            progress("charts", min(0.99, (target - 4) / max(energy - 4, 1e-9)))
+        full = max_charts is not None and atlas.cut.num_charts >= max_charts
+        if energy <= target or full:
+            break
+        moves = _moves(atlas, target, known)
+        chosen = _best(moves, atlas, target)
+        if not chosen:
+            break
+        corner = atlas.corner_uv.copy()
+        for move in chosen:
+            corner[move.faces] = move.corner_uv
+        seams = np.concatenate([move.edges for move in chosen])
+        opened = atlas.opened(seams)
+        atlas = opened.carried(opened.cut, corner)
+    return atlas.relaxed(_FINAL_STEPS, gain=1e-4)
+
+
+def _best(moves: list[Move], atlas: Atlas, target: float) -> list[Move]:
+    """The moves of the best ratio of gain to price, not more than are needed."""
+    surplus = float(atlas.face_excess.sum() - (target - ISOMETRIC) * atlas.rest.area.sum())
+    order = sorted(range(len(moves)), key=lambda i: (-moves[i].gain / moves[i].price, i))
+    chosen: list[Move] = []
+    for i in order:
+        move = moves[i]
+        best = moves[order[0]].gain / moves[order[0]].price
+        if (
+            move.gain <= 0
+            or len(move.edges) == 0
+            or surplus <= 0
+            or move.gain / move.price < 0.4 * best
+        ):
+            break
+        chosen.append(move)
+        surplus -= move.gain
+    return chosen
+
+
+def _units(atlas: Atlas) -> list[tuple[int, ...]]:
+    """Charts that are changed together: a chart and its mirror image, or one alone."""
+    mates = chart_mates(atlas.surface, atlas.cut)
+    return [
+        (chart, int(mate)) if mate > chart else (chart,)
+        for chart, mate in enumerate(mates)
+        if mate < 0 or mate >= chart
+    ]
+
+
+def _moves(atlas: Atlas, target: float, known: dict[tuple[int, ...], Move]) -> list[Move]:
+    """The best move of each unit; those that are not known yet are tried out, all at once."""
+    cut = atlas.cut
+    excess = np.bincount(cut.chart, atlas.face_excess, minlength=cut.num_charts)
+    first = np.full(cut.num_charts, len(cut.chart))
+    np.minimum.at(first, cut.chart, np.arange(len(cut.chart)))
+    size = np.bincount(cut.chart, minlength=cut.num_charts)
+    open_sides = np.bincount(
+        cut.chart, cut.seams[cut.edges.of_face].sum(1), minlength=cut.num_charts
+    ).astype(int)
+    units = _units(atlas)
+    weight = [float(excess[list(u)].sum()) for u in units]
+    surplus = float(excess.sum() - (target - ISOMETRIC) * atlas.rest.area.sum())
+    floor = min(0.3 * max(weight), 0.02 * surplus)
+    units = [u for u, w in zip(units, weight, strict=True) if w >= floor]
+    keys = [tuple(int(x) for c in u for x in (first[c], size[c], open_sides[c])) for u in units]
+    fresh = [i for i, key in enumerate(keys) if key not in known]
+    if fresh:
+        for i, move in zip(fresh, _tried(atlas, [units[i] for i in fresh]), strict=True):
+            known[keys[i]] = move
+    return [known[key] for key in keys]
+
+
+def _tried(atlas: Atlas, units: list[tuple[int, ...]]) -> list[Move]:
+    """For each unit the better one of a slit and a split."""
+    cut, surface = atlas.cut, atlas.surface
+    leads = np.array([u[0] for u in units])
+    density = atlas.density
+    mean = np.bincount(cut.chart, atlas.face_excess) / np.bincount(cut.chart, atlas.rest.area)
+    slits = tip_slits(surface, cut, density, leads)
+    splits = halves(surface, cut, leads, atlas.rest.area * (density + 0.1 * mean[cut.chart]))
+    options = [_moves_of(atlas, units, edges) for edges in (slits, splits)]
+    return [max(pair, key=lambda m: m.gain / m.price) for pair in zip(*options, strict=True)]
+
+
+def _moves_of(atlas: Atlas, units: list[tuple[int, ...]], edges: np.ndarray) -> list[Move]:
+    cut, surface = atlas.cut, atlas.surface
+    chart = cut.chart[np.maximum(cut.edges.face_pairs[edges, 0], 0)]
+    groups = []
+    for unit in units:
+        own = edges[chart == unit[0]]
+        if len(unit) > 1:
+            own = np.union1d(own, mirrored_edges(surface, own))
+        elif surface.mirror is not None and _is_own_mate(atlas, unit[0]):
+            own = symmetric_edges(surface, own)
+        groups.append(own[~cut.seams[own]])
+    trial = atlas.opened(np.concatenate(groups))
+    active = np.isin(cut.chart, np.concatenate(units))
+    trial = trial.relaxed(_TRIAL_STEPS, active)
+    corner, before, after = trial.corner_uv, atlas.face_excess, trial.face_excess
+    scale = float(np.sqrt(atlas.rest.area.sum()))
+    moves = []
+    for unit, own in zip(units, groups, strict=True):
+        faces = np.flatnonzero(np.isin(cut.chart, unit))
+        new = len(np.unique(trial.cut.chart[faces])) - len(unit)
+        price = _SEAM_PRICE + float(surface.length[own].sum()) / scale + _CHART_PRICE * new
+        gain = float(before[faces].sum() - after[faces].sum())
+        moves.append(Move(own, faces, corner[faces], gain, price))
+    return moves
+
+
+def _is_own_mate(atlas: Atlas, chart: int) -> bool:
+    return int(chart_mates(atlas.surface, atlas.cut)[chart]) == chart
+
+
+def _separated(atlas: Atlas, pairs: Int[np.ndarray, "n 2"]) -> Atlas:
+    """Every chart that lies on itself cut between the faces that meet."""
+    cut, surface = atlas.cut, atlas.surface
+    field = fiedler(surface, cut, first_guess(surface)[cut.origin], atlas.rest.area)
+    charts = np.unique(cut.chart[pairs[:, 0]])
+    field = separators(surface, cut, pairs, field)
+    meets = np.bincount(pairs.reshape(-1), minlength=len(cut.chart)) > 0
+    edges = split_paths(surface, cut, field, atlas.rest.area * (meets + 0.01), charts)
+    edges = edges[~cut.seams[edges]]
+    chart = cut.chart[np.maximum(cut.edges.face_pairs[edges, 0], 0)]
+    missed = np.setdiff1d(charts, chart)
+    if len(missed):
+        edges = np.union1d(edges, halves(surface, cut, missed, atlas.rest.area))
+    active = np.isin(cut.chart, charts)
+    return atlas.opened(edges).relaxed(_TRIAL_STEPS, active)
