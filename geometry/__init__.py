@@ -79,8 +79,6 @@ if TYPE_CHECKING:
     from .unwrap import UnwrapOptions as UnwrapOptions
     from .unwrap import UVLayout as UVLayout
     from .uv import UVMap as UVMap
-    from .weight_transfer import closest_faces as closest_faces
-    from .weight_transfer import transfer_rows as transfer_rows
     from .uv_lookup import UVHit as UVHit
     from .uv_lookup import UVIndex as UVIndex
     from .uv_lookup import transfer_uv as transfer_uv
@@ -90,6 +88,8 @@ if TYPE_CHECKING:
     from .uv_texture import fill_gutter as fill_gutter
     from .uv_texture import sample_texture as sample_texture
     from .uv_texture import texel_map as texel_map
+    from .weight_transfer import closest_faces as closest_faces
+    from .weight_transfer import transfer_rows as transfer_rows
 
 _ROOM = {
     "BackendError": "errors",
