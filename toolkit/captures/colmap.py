@@ -12,10 +12,10 @@ from typing import TypeVar
 
 import torch
 
+from monopart.geometry.atomic import write_bytes, write_text
 from monopart.geometry.cameras import Camera
 from monopart.geometry.errors import InputError
 from monopart.geometry.rotations import quat_wxyz_to_rotmat, rotmat_to_quat_wxyz
-from monopart.geometry.atomic import write_bytes, write_text
 
 
 @dataclass(frozen=True)

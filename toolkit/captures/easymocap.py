@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import torch
 
+from monopart.geometry.atomic import replacing
 from monopart.geometry.cameras import Camera
 from monopart.geometry.errors import InputError
-from monopart.geometry.atomic import replacing
 
 Sizes = tuple[int, int] | Mapping[str, tuple[int, int]] | None
 """(height, width) of all cameras, or by name; None where the file says it."""
