@@ -88,6 +88,7 @@ def carried_uv(
     uv, gap, face = uv.reshape(-1, 3, 2), gap.reshape(-1, 3), face.reshape(-1, 3)
     odd = np.flatnonzero(_crossing(source, (home, face), (middle, corners), uv))
     links = _Links(uv_neighbours(source), source)
+    low, high = _uv(source).min((0, 1)), _uv(source).max((0, 1))  # beyond them there is no picture
     for row in odd:
         patch = links.around(int(home[row]), middle[row], corners[row])
         near = closest_faces(inner[row], source.verts, source.faces[patch])[0]
@@ -96,7 +97,7 @@ def carried_uv(
         expected, centre = _continued(source, int(home[row]), corners[row])
         reach = np.linalg.norm(expected - centre, axis=1).max()
         if np.linalg.norm(uv[row] - expected, axis=1).max() > _STRETCH * reach:
-            uv[row] = expected
+            uv[row] = np.clip(expected, low, high)
     return uv, gap, len(odd)
 
 
