@@ -118,12 +118,12 @@ def _project_families() -> tuple[Family, ...]:
     out = [
         Family("3 m", _ahead(plain, (2.0, 4.0), 0.3), extra=plain, step=1e-6),
         Family("depth 1e-2", _ahead(plain, (1e-2, 2e-2), 0.3), extra=plain, step=1e-8),
-        Family("depth 1e-5", _ahead(plain, (1e-5, 2e-5), 0.3), extra=plain, step=1e-11, slope=0.1),
+        Family("depth 1e-5", _ahead(plain, (1e-5, 2e-5), 0.3), extra=plain, step=1e-11),
         Family("depth 0", _ahead(plain, (0.0, 0.0), 0.3), extra=plain, smooth=False),
         Family("behind", _ahead(plain, (-4.0, -1e-3), 0.3), extra=plain),
         Family("1 km", _ahead(plain, (900.0, 1100.0), 0.3), extra=plain, step=1e-3),
-        Family("89.9° off axis", grazing, extra=plain, step=1e-6, slope=1e-3),
-        Family("100 km away", _ahead(far, (2.0, 4.0), 0.3), extra=far, step=1e-4, slope=0.1),
+        Family("89.9° off axis", grazing, extra=plain, step=1e-6),
+        Family("100 km away", _ahead(far, (2.0, 4.0), 0.3), extra=far, step=1e-4),
     ]
     for name, one in (
         *(("focal 1", camera(focal=1.0)), ("focal 1e6", camera(focal=1e6))),
@@ -190,7 +190,7 @@ def _rays() -> Stress:
         ("principal point outside", camera(centre=-5000.0), 5.0, False),
     ):
         step = 1e-6 * float(one.K[0, 0])
-        families.append(Family(name, _image(one, reach, special), extra=one, step=step, slope=1e-3))
+        families.append(Family(name, _image(one, reach, special), extra=one, step=step))
     return Stress(
         name="rays",
         title="rays of a pinhole",

@@ -85,7 +85,7 @@ def _grids() -> Stress:
     usual = _grid()
     # weights of corners far from a point are small differences: their gradients lose digits
     families = [
-        Family(k, _in_cube(usual, k), extra=usual, smooth=k == "inside", step=1e-9, slope=1e-2)
+        Family(k, _in_cube(usual, k), extra=usual, smooth=k == "inside", step=1e-9)
         for k in ("inside", "borders", "next to borders", "corners", "outside", "infinite", "1e-30")
     ]
     for name, grid in (
@@ -96,7 +96,7 @@ def _grids() -> Stress:
         # in float32 a place on 65536 cells has 8 bits of its cell left: the slope is a neighbour's
         smooth = name != "65536 cells"
         made = _in_cube(grid, "inside")
-        families.append(Family(name, made, extra=grid, step=1e-10, smooth=smooth, slope=1e-2))
+        families.append(Family(name, made, extra=grid, step=1e-10, smooth=smooth))
     return Stress(
         name="hash_grid",
         title="hash grid",
@@ -239,7 +239,7 @@ def _residual() -> Stress:
 
     nets = _Nets.of(lambda: ResidualField(1))
     families = [
-        Family(k, _coordinates(k), extra=nets, smooth=k == "inside", step=1e-8, slope=1e-3)
+        Family(k, _coordinates(k), extra=nets, smooth=k == "inside", step=1e-8)
         for k in ("inside", "0 and 1", "outside", "1e6")
     ]
     return Stress(

@@ -98,7 +98,7 @@ def _composite() -> Stress:
         ("no samples", _Rays(0), lambda s: s, lambda s: s, False),
     )
     families = tuple(
-        Family(name, _march(rays, sigma, delta), extra=rays, smooth=smooth, step=1e-9, slope=2e-3)
+        Family(name, _march(rays, sigma, delta), extra=rays, smooth=smooth, step=1e-9)
         for name, rays, sigma, delta, smooth in shapes
     )
     return Stress(
