@@ -253,6 +253,7 @@ ROOMS = {
     "cameras": "Cameras and rays",
     "fields": "Encodings, networks, grids",
     "volume": "Compositing and parts",
+    "losses": "Losses and retrieval",
 }
 """Groups of operations, each a module ``stability_NAME`` and a heat map."""
 

@@ -111,7 +111,7 @@ def _composite() -> Stress:
         exact=exact_composite,
         wrt=(0, 1, 2),
         rows_apart=False,
-        limit=3e-6,
+        limit=3e-7,
     )
 
 
