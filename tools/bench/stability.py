@@ -250,6 +250,7 @@ ROOMS = {
     "rotations": "Rotations and affine maps",
     "skinning": "Kinematics, skinning, bodies",
     "surface": "Surfaces",
+    "parts": "Signs, shells, parts, roots",
     "cameras": "Cameras and rays",
     "fields": "Encodings, networks, grids",
     "volume": "Compositing and parts",
