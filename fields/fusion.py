@@ -172,7 +172,7 @@ class _WarpAttention(torch.autograd.Function):
         bias = functional.pad(query.new_zeros(codes), (0, missing), value=_NEVER)
         ends = torch.tensor(list(itertools.accumulate(counts)), dtype=torch.int32)
         sets = (ends.to(query.device), query, keys, values, bias)
-        out, total = torch.empty_like(query), query.new_empty(rows, heads)
+        out, total = torch.empty_like(query), query.new_empty(rows, heads, 2)
         args = [1 / math.sqrt(dim), *(view(x.view(-1)) for x in (*sets, out, total))]
         launch(attention_kernel(heads, dim, codes + missing), rows, args, query)
         ctx.save_for_backward(*sets, out, total)

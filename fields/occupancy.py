@@ -104,7 +104,8 @@ def visible_samples(
     """Samples with less than a given optical depth in front of them.
 
     Args:
-        wall: optical depth of each sample (density times step), a lower bound.
+        wall: optical depth of each sample (density times step), a lower bound; infinity is opaque,
+            NaN is no wall.
         ray_start: first sample of each ray, and the end.
         ray: ray of each sample.
         limit: optical depth beyond which nothing is seen; 10 leaves 5e-5 of the light.
@@ -116,7 +117,9 @@ def visible_samples(
     >>> visible_samples(wall, torch.tensor([0, 3, 4]), ray, 10.0).tolist()
     [True, True, False, True]
     """
-    total = wall.double().cumsum(0)
+    # more than the limit blocks as the limit does, and an infinite sum would end all rays behind it
+    wall = wall.double().nan_to_num(nan=0.0).clamp(max=limit)
+    total = wall.cumsum(0)
     before = total - wall
     base = torch.cat([total.new_zeros(1), total])[ray_start[:-1]]
     return before - base[ray.long()] < limit

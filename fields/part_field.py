@@ -8,6 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from monopart.geometry.errors import InputError
+
 from .hash_grid import GridSpec, HashGrid
 from .mlp import PartMLP
 
@@ -73,8 +75,16 @@ class PartField(torch.nn.Module):
             lo: lower corners of the parts' canonical boxes, margin included, metres.
             hi: upper corners.
             spec: sizes.
+
+        Raises:
+            InputError: a box without extent, or one that is not finite.
         """
         super().__init__()
+        if not bool(((hi - lo).amax(-1) > 0).all() and (hi - lo).isfinite().all()):
+            raise InputError(
+                "PartField lo, hi: expected finite boxes with hi > lo on some axis, found one "
+                "without extent; check the boxes"
+            )
         parts = len(lo)
         self.spec = spec
         edge = (hi - lo).amax(-1)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from monopart.geometry.errors import BackendError
+from monopart.geometry.errors import BackendError, InputError
 
 from .backend import Backend, choose_backend
 
@@ -27,10 +27,22 @@ class AdamRule:
     Attributes:
         betas: decay of the mean and of the mean square, per step.
         eps: added to the root mean square.
+
+    Raises:
+        InputError: betas outside [0, 1), or the first above the root of the second: the ratio of a
+            resting row would grow with every missed step, and overflow.
     """
 
     betas: tuple[float, float] = (0.9, 0.99)
     eps: float = 1e-15
+
+    def __post_init__(self) -> None:
+        first, second = self.betas
+        if not (0 <= first < 1 and 0 < second < 1 and first * first <= second):
+            raise InputError(
+                f"AdamRule betas: expected 0 <= first <= root of second < 1, found {self.betas}; "
+                "use (0.9, 0.99)"
+            )
 
 
 @dataclass(frozen=True)
@@ -141,7 +153,7 @@ def _missed(beta1: float, beta2: float, device: torch.device, dtype: torch.dtype
     """
     gap = torch.arange(_LONGEST, dtype=torch.float64)
     ratio = beta1 / math.sqrt(beta2)
-    movement = gap if ratio == 1 else ratio * (1 - ratio**gap) / (1 - ratio)
+    movement = torch.cat([gap[:1], (ratio ** gap[1:]).cumsum(0)])  # its closed form cancels at 1
     return torch.stack([beta1**gap, beta2**gap, movement], -1).to(device, dtype)
 
 

@@ -266,7 +266,8 @@ class BodyShell:
             body: index of the body, one for all or one per ray.
 
         Returns:
-            near and far in metres along the ray (0 where missed), and the mask of hits.
+            near and far in metres along the ray (0 where missed), and the mask of hits; False for
+            a ray without a direction, or that is not finite.
         """
         from .kernels.launch import launch, view
         from .kernels.shell import ray_intervals
@@ -297,7 +298,8 @@ class BodyShell:
             jitter: offset of the lattice in steps, in [0, 1); None is the middle, 0.5.
 
         Returns:
-            The samples, sorted by ray and front to back.
+            The samples, sorted by ray and front to back; none of a ray without a direction, or that
+            is not finite.
 
         Raises:
             InputError: the step is not positive.

@@ -194,12 +194,30 @@ def distort_extended(
     """
     if coefficients.shape[-1] == 0:
         return points
-    limit = min(radius, 1e3)
-    # the clamp keeps sqrt away from 0, where its gradient is infinite
-    stretch = torch.sqrt(points.square().sum(-1, keepdim=True).clamp_min(limit**2)) / limit
+    stretch = stretch_beyond(points, min(radius, 1e3))
     tilt, coefficients = _tilt(coefficients), coefficients[:12]
     bent = distort(points / stretch, coefficients) * stretch
     return bent if tilt is None else map_plane(bent, tilt)[0]
+
+
+def stretch_beyond(points: Float[Tensor, "*b 2"], limit: float) -> Float[Tensor, "*b 1"]:
+    """How many times farther than a radius points lie; 1 inside it.
+
+    Args:
+        points: finite points of a plane, *b 2, however far: squares are taken of shares of their
+            largest coordinate, which do not overflow.
+        limit: the radius, above 0.
+
+    Returns:
+        max(|point| / limit, 1), *b 1, differentiable.
+
+    >>> stretch_beyond(torch.tensor([[3e30, 4e30], [0.3, 0.4]]), 1.0).tolist()
+    [[4.999999850468094e+30], [1.0]]
+    """
+    size = points.detach().abs().amax(-1, keepdim=True).clamp_min(limit)
+    # the clamp keeps sqrt away from 0, where its gradient is infinite
+    square = (points / size).square().sum(-1, keepdim=True)
+    return torch.sqrt(torch.maximum(square, (limit / size).square())) * (size / limit)
 
 
 def undistort(

@@ -1,6 +1,5 @@
 """The kinds of lens that a camera can have, behind one set of functions."""
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -76,8 +75,7 @@ def lens_distort(
     if lens == "brown":
         return distortion.distort_extended(points, coefficients, radius)
     limit = min(radius, fisheye.MAX_RADIUS)
-    # the clamp keeps sqrt away from 0, where its gradient is infinite
-    stretch = torch.sqrt(points.square().sum(-1, keepdim=True).clamp_min(limit**2)) / limit
+    stretch = distortion.stretch_beyond(points, limit)
     return fisheye.fisheye_distort(points / stretch, coefficients) * stretch
 
 

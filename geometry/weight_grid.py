@@ -61,9 +61,11 @@ class WeightGrid:
     ) -> tuple[Float[Tensor, "n 8"], Float[Tensor, "n 8 3"]]:
         """Trilinear weights of the corners of the cells of points, and their gradients, 1/metre.
 
-        The weights are differentiable in the points, the cell held.
+        The weights are differentiable in the points, the cell held; those of a point that is not
+        finite are the ones of the lowest node, without gradient.
         """
-        q = (points - points.new_tensor(self.lo)) / self.voxel
+        lo = points.new_tensor(self.lo)
+        q = (torch.where(points.isfinite().all(-1, keepdim=True), points, lo) - lo) / self.voxel
         q = q - q.detach().floor()
         sides = torch.stack([1 - q, q], 1)  # n 2 3
         low, high = [0, 1] * 4, [0, 0, 1, 1] * 2

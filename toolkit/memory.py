@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from monopart.geometry.norms import safe_norm
 from monopart.geometry.parts import PartMap
 from monopart.geometry.rotations import axis_angle_to_rotmat, rotation_angle
 
@@ -105,16 +106,17 @@ _NARROWEST = 1e-3  # radians: the width where training poses are equal
 
 def _part_distances(rotmats: Tensor, others: Tensor, joints: tuple[tuple[int, ...], ...]) -> Tensor:
     """Distance of a pose [J, 3, 3] to others [F, J, 3, 3] by part, [K, F] radians."""
-    squared = rotation_angle(rotmats.expand_as(others), others).square()
-    return torch.stack([squared[:, list(part)].sum(-1) for part in joints]).sqrt()
+    angles = rotation_angle(rotmats.expand_as(others), others)
+    return torch.stack([safe_norm(angles[:, list(part)]) for part in joints])
 
 
-def _nearest(distance: Tensor, width: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def _nearest(distance: Tensor, width: Tensor | float, count: int) -> tuple[Tensor, Tensor]:
     """Rows of the nearest of the last axis, the first of equals first, and their weights."""
     near, rows = distance.sort(stable=True, dim=-1)
     near, rows = near[..., :count], rows[..., :count]
     # relative to the nearest: the same weights, and none is lost to rounding far from all poses
-    return rows, torch.softmax((near[..., :1] ** 2 - near**2) / (2 * width**2), -1)
+    first = near[..., :1]
+    return rows, torch.softmax((first - near) * (first + near) / (2 * width**2), -1)
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ class PoseMemory:
     def distances(self, pose: Float[Tensor, "j 3"]) -> Float[Tensor, "f"]:
         """Root of the summed squared joint angles to each training pose, without the root joint."""
         query = axis_angle_to_rotmat(pose)[None].expand_as(self.rotmats)
-        return rotation_angle(query[:, 1:], self.rotmats[:, 1:]).square().sum(-1).sqrt()
+        return safe_norm(rotation_angle(query[:, 1:], self.rotmats[:, 1:]))
 
     def weights(
         self, frame: int | None, pose: Float[Tensor, "j 3"], count: int = NEIGHBOURS
@@ -168,9 +170,7 @@ class PoseMemory:
         if frame in self.frames:
             row = torch.tensor([self.frames.index(frame)], device=pose.device)
             return row, torch.ones(1, device=pose.device)
-        distance = self.distances(pose)
-        near, rows = distance.topk(min(count, len(distance)), largest=False)
-        return rows, torch.softmax(-(near**2) / (2 * self.width**2), 0)
+        return _nearest(self.distances(pose), self.width, count)
 
     def time(self, row: int | Tensor) -> Tensor:
         """Normalised time of training rows: 0 for the first, 1 for the last."""

@@ -1,9 +1,9 @@
 """Warp kernels of the attention of samples over the codes of their part.
 
 One thread per sample, heads inside. On the CPU eight codes make one vector; the backward pass makes
-the weights again from the logarithm of their sum. Keys and values are [part, head, d, code]. Codes
-are padded to a multiple of 16; the bias of a padded code is so low that its weight counts for
-nothing.
+the weights again, relative to the best score as the forward pass does: the logarithm of their sum
+would be rounded like a score. Keys and values are [part, head, d, code]. Codes are padded to a
+multiple of 16; the bias of a padded code is so low that its weight counts for nothing.
 """
 # a kernel lists its arrays and is one body; Warp reads the annotations
 
@@ -80,7 +80,8 @@ _FORWARD = (
         }
         const float sum = FUSION_SUM(total_of), share = 1.0f / sum;
         for (int d = 0; d < DIM; d++) out.data[row + d] = FUSION_SUM(found[d]) * share;
-        total.data[(long long)i * HEADS + h] = top + logf(sum);
+        total.data[2 * ((long long)i * HEADS + h)] = top;
+        total.data[2 * ((long long)i * HEADS + h) + 1] = share;
     }
 """
 )
@@ -91,11 +92,12 @@ _BACKWARD = (
     + """
         float* __restrict__ gk = grad_keys.data + set * DIM;
         float* __restrict__ gv = grad_values.data + set * DIM;
-        const float whole = total.data[(long long)i * HEADS + h];
-        float o[DIM], along = 0.0f;
+        const float top = total.data[2 * ((long long)i * HEADS + h)];
+        const float share = total.data[2 * ((long long)i * HEADS + h) + 1];
+        float o[DIM], mean[DIM];
         for (int d = 0; d < DIM; d++) {
             o[d] = cotangent.data[row + d];
-            along += o[d] * out.data[row + d];
+            mean[d] = out.data[row + d];
         }
         V to[DIM];
         for (int d = 0; d < DIM; d++) to[d] = *(const V*)bias.data * 0.0f;
@@ -103,16 +105,17 @@ _BACKWARD = (
         for (int b = 0; b < CODES; b += 2 * W) {
             V p[2], slope[2];
             for (int n = 0; n < 2; n++) {
-                p[n] = *(const V*)(bias.data + b + n * W) - whole;
-                slope[n] = to[0] * 0.0f - along;
+                p[n] = *(const V*)(bias.data + b + n * W);
+                slope[n] = p[n] * 0.0f;
             }
             for (int d = 0; d < DIM; d++)
                 for (int n = 0; n < 2; n++) {
                     p[n] += q[d] * *(const V*)(kt + d * CODES + b + n * W);
-                    slope[n] += o[d] * *(const V*)(vt + d * CODES + b + n * W);
+                    slope[n] += o[d] * (*(const V*)(vt + d * CODES + b + n * W) - mean[d]);
                 }
             for (int n = 0; n < 2; n++) {
-                FUSION_EXP(p[n], p[n])
+                FUSION_EXP(p[n], p[n] - top)
+                p[n] *= share;
                 slope[n] *= p[n];
             }
             for (int d = 0; d < DIM; d++)

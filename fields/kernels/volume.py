@@ -36,6 +36,15 @@ def _opacity(x: float) -> float:
 
 
 @no_type_check
+@wp.func
+def _add(total: wp.vec2, x: float) -> wp.vec2:
+    """Add to a sum and what rounding has added to it too much (Kahan): thousands of terms."""
+    y = x - total[1]
+    t = total[0] + y
+    return wp.vec2(t, (t - total[0]) - y)
+
+
+@no_type_check
 @wp.kernel(enable_backward=False)
 def composite_forward(
     start: int,
@@ -55,8 +64,10 @@ def composite_forward(
     r = start + wp.tid()
     t = float(1.0)
     c = wp.vec3(0.0, 0.0, 0.0)
-    o = float(0.0)
-    d = float(0.0)
+    lost = wp.vec3(0.0, 0.0, 0.0)
+    in_front = wp.vec2(0.0, 0.0)
+    o = wp.vec2(0.0, 0.0)
+    d = wp.vec2(0.0, 0.0)
     for i in range(int(ray_start[r]), int(ray_start[r + 1])):
         if t <= stop:
             weights[i] = 0.0
@@ -64,16 +75,21 @@ def composite_forward(
         else:
             x = _optical(sigma[i], delta[i])
             w = t * _opacity(x)
-            t = t * wp.exp(-x)
-            c += w * color[i]
-            o += w
+            # of the sum, not a product of exponentials, whose roundings would add up
+            in_front = _add(in_front, x)
+            t = wp.exp(-in_front[0])
+            more = w * color[i] - lost
+            summed = c + more
+            lost = (summed - c) - more
+            c = summed
+            o = _add(o, w)
             if depth.shape[0] > 0:
-                d += w * depth[i]
+                d = _add(d, w * depth[i])
             weights[i] = w
             behind[i] = t
     ray_color[r] = c
-    ray_opacity[r] = o
-    ray_depth[r] = d
+    ray_opacity[r] = o[0]
+    ray_depth[r] = d[0]
 
 
 @no_type_check
@@ -99,13 +115,13 @@ def composite_backward(
     r = start + wp.tid()
     first = int(ray_start[r])
     last = int(ray_start[r + 1])
-    suffix = float(0.0)
+    suffix = wp.vec2(0.0, 0.0)
     for n in range(last - first):
         i = last - 1 - n
         w = weights[i]
         g = wp.dot(ray_color[r], color[i]) + ray_opacity[r] + sample_weights[i]
         if depth.shape[0] > 0:
             g += ray_depth[r] * depth[i]
-        grad_optical[i] = behind[i] * g - suffix
+        grad_optical[i] = behind[i] * g - suffix[0]
         grad_color[i] = w * ray_color[r]
-        suffix += w * g
+        suffix = _add(suffix, w * g)

@@ -85,7 +85,12 @@ def slab(o: float, d: float, lo: float, hi: float, span: wp.vec2):
 @no_type_check
 @wp.func
 def span_of(o: wp.vec3, d: wp.vec3, lo: wp.vec3, n: wp.vec3i, voxel: float):
-    """Interval of a ray inside a grid; empty when its end is before its start."""
+    """Interval of a ray inside a grid; empty when its end is before its start.
+
+    A ray without a direction, or with one that is NaN, meets nothing: it would never leave.
+    """
+    if not (wp.dot(d, d) > 1.0e-12):
+        return wp.vec2(1.0, 0.0)
     span = wp.vec2(0.0, 1.0e30)
     span = slab(o[0], d[0], lo[0], lo[0] + float(n[0]) * voxel, span)
     span = slab(o[1], d[1], lo[1], lo[1] + float(n[1]) * voxel, span)

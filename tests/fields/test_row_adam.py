@@ -5,6 +5,7 @@ import torch
 
 from monopart.fields.hash_grid import GridSpec, HashGrid
 from monopart.fields.row_adam import AdamRule, RowAdam, RowMoments, row_adam
+from monopart.geometry.errors import InputError
 
 RULE = AdamRule(eps=1e-15)
 
@@ -150,3 +151,25 @@ def test_state_is_put_back_bit_for_bit():
             optimizer.step()
         runs.append(table.detach())
     assert torch.equal(*runs)
+
+
+@pytest.mark.parametrize("betas", [(0.9, 0.5), (1.0, 0.99), (0.9, 1.0), (-0.1, 0.9), (0.9, 0.0)])
+def test_a_rule_whose_missed_movements_grow_is_refused(betas: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match="betas"):
+        AdamRule(betas)
+
+
+@pytest.mark.parametrize("second", [0.81, 0.81 + 1e-12])
+def test_missed_movements_next_to_a_ratio_of_one(second: float) -> None:
+    rule, start = AdamRule((0.9, second)), torch.ones(1, 1, dtype=torch.float64)
+    table, grad = start.clone(), start.clone()
+    moments = RowMoments(start * 0, start * 0, torch.zeros(1, dtype=torch.int32))
+    row_adam(table, grad, moments, 1, 0.1, rule, "torch")
+    before, mean, square = float(table), float(moments.mean), float(moments.square)
+    row_adam(table, start.clone(), moments, 5, 0.1, rule, "torch")
+    rate, root, eps = 0.1 / (1 - 0.9**5), 1 / (1 - second**5) ** 0.5, rule.eps
+    missed = sum((0.9 / second**0.5) ** k for k in (1, 2, 3))
+    wanted = before - rate * missed * mean / (square**0.5 * root + eps)
+    mean, square = 0.9**4 * mean + 0.1, second**4 * square + 1 - second
+    wanted -= rate * mean / (square**0.5 * root + eps)
+    assert float(table) == pytest.approx(wanted, rel=1e-14)

@@ -22,10 +22,21 @@ from torch import Tensor
 
 from monopart.geometry.errors import InputError
 
-from .stability_cases import DOUBLE, HALVES, Cell, Family, Inputs, Outcome, Stress, Way
+from .stability_cases import (
+    DOUBLE,
+    HALVES,
+    Cell,
+    Family,
+    Inputs,
+    Outcome,
+    Slopes,
+    Stress,
+    Way,
+)
 
-SCHEMA = 1
+SCHEMA = 2
 _FLOOR = 1e-3  # gradients below this share of the largest of their family are compared with it
+_DRAWS = 3  # of inputs moved by one last place
 
 
 def _as_rows(values: np.ndarray) -> np.ndarray:
@@ -169,43 +180,63 @@ def measure(
         with torch.no_grad():
             result, valid = _apply(way, family, inputs)
         relative, gap, bad, size = _value_errors(stress, family, inputs, result, valid, known)
-        slope, gain, bad_slopes = None, None, 0
+        slopes = Slopes()
         if way.differentiable and stress.wrt and len(result):
-            slope, gain, bad_slopes = _slopes(stress, family, way, inputs, size)
+            slopes = _slopes(stress, family, way, inputs, size)
     except (ImportError, RuntimeError, ValueError, IndexError, TypeError) as error:
         if way.ours:
             raise
         text = f"{type(error).__name__}: {' '.join(str(error).split())[:100]}"
-        return Cell(*head, family.inside, 0, 0, None, None, None, None, 0, 0, text)
-    masked = int((~valid).sum())
-    counts = (len(result), masked)
-    return Cell(*head, family.inside, *counts, relative, gap, slope, gain, bad, bad_slopes)
+        return Cell(*head, family.inside, 0, 0, None, None, Slopes(), 0, text)
+    counts = (len(result), int((~valid).sum()))
+    return Cell(*head, family.inside, *counts, relative, gap, slopes, bad)
 
 
-def _slopes(
-    stress: Stress, family: Family, way: Way, inputs: Inputs, size: np.ndarray
-) -> tuple[float | None, float | None, int]:
-    """Error of the gradient, amplification, and how many gradients are not finite."""
+def _slopes(stress: Stress, family: Family, way: Way, inputs: Inputs, size: np.ndarray) -> Slopes:
+    """Error of the gradient, what it is allowed to be, amplification, and how many are bad."""
     found, valid = _gradients(way, family, inputs, stress.wrt)
     bad = sum(int(_flat(~g.isfinite()).any(1).sum()) for g in found if g.numel())
     if not family.smooth or not family.inside:
-        return None, None, bad
+        return Slopes(bad=bad)
+    error, spread = None, None
     exact_inputs = tuple(x.double() for x in inputs)
     if inputs[0].dtype == DOUBLE:
         error = _differences(stress, way, family, exact_inputs, found)
     elif (judge := _judge(stress, way)) is not None:
         true, true_valid = _gradients(judge, family, exact_inputs, stress.wrt)
         # a mask that flips by rounding changes the sum: nothing to compare then
-        error = _gradient_error(found, true) if torch.equal(valid, true_valid) else None
-    else:
-        error = None
+        if torch.equal(valid, true_valid):
+            error = _gradient_error(found, true)
+            spread = _spread(stress, judge, family, inputs, (true, true_valid))
     gains = [
         float((g.double() * x.double()).abs().max()) / float(np.min(size))
         for g, x in zip(found, (inputs[i] for i in stress.wrt), strict=True)
         if g.numel()
     ]
     kept = [g for g in gains if np.isfinite(g)]
-    return error, max(kept) if kept else None, bad
+    return Slopes(error, spread, max(kept) if kept else None, bad)
+
+
+def _spread(
+    stress: Stress, judge: Way, family: Family, inputs: Inputs, true: tuple[list[Tensor], Tensor]
+) -> float | None:
+    """What one last place in the inputs does to the exact gradient: no float can do better.
+
+    Every number is moved, up or down, by one last place of the largest of its row. The change is
+    measured as an error would be.
+    """
+    generator, worst = torch.Generator().manual_seed(29), []
+    for _ in range(_DRAWS):
+        moved = []
+        for x in inputs:
+            up = torch.randint(0, 2, x.shape, generator=generator) * 2.0 - 1.0
+            size = _largest(x.double()).reshape(-1, *[1] * (x.ndim - 1))
+            moved.append(x.double() + torch.finfo(x.dtype).eps * size * up)
+        found, valid = _gradients(judge, family, tuple(moved), stress.wrt)
+        if torch.equal(valid, true[1]):
+            worst.append(_gradient_error(found, true[0]))
+    kept = [w for w in worst if w is not None]
+    return max(kept) if kept else None
 
 
 def _judge(stress: Stress, way: Way) -> Way | None:
@@ -219,9 +250,11 @@ ROOMS = {
     "rotations": "Rotations and affine maps",
     "skinning": "Kinematics, skinning, bodies",
     "surface": "Surfaces",
+    "parts": "Signs, shells, parts, roots",
     "cameras": "Cameras and rays",
     "fields": "Encodings, networks, grids",
     "volume": "Compositing and parts",
+    "losses": "Losses and retrieval",
 }
 """Groups of operations, each a module ``stability_NAME`` and a heat map."""
 
@@ -286,7 +319,7 @@ def write_json(outcome: Outcome, path: Path) -> None:
         path: the file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    cells = [dataclasses.asdict(c) | {"ulp": c.ulp} for c in outcome.cells]
+    cells = [c.as_dict() for c in outcome.cells]
     data = {"schema": SCHEMA, "cases": outcome.cases, "absent": outcome.absent, "cells": cells}
     path.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 

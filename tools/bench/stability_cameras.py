@@ -1,6 +1,6 @@
 """Stress of cameras, lenses, rays and boxes."""
 
-import math
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -9,38 +9,12 @@ from torch import Tensor
 
 from monopart.geometry.boxes import ray_box
 from monopart.geometry.cameras import MIN_DEPTH, Camera, Rays
-from monopart.geometry.distortion import distort_extended
-from monopart.geometry.rotations import axis_angle_to_rotmat
+from monopart.geometry.lenses import lens_distort
 
 from .registry import load
 from .stability_cases import DOUBLE, Family, Inputs, Stress, Way
+from .stability_lenses import LENSES, camera, exact_lens
 from .stability_rotations import Make, axes
-
-LENSES = {
-    "pinhole": (),
-    "usual lens": (-0.25, 0.11, 0.001, -0.0005, -0.02),
-    "strong barrel": (-0.5, 0.1, 0.0, 0.0, 0.0),
-    "strong pincushion": (0.6, 0.5, 0.0, 0.0, 0.0),
-    "rational, prism": (0.1, 0.02, 1e-3, 1e-3, 0.01, 0.2, 0.05, 0.01, 1e-3, 1e-4, 1e-3, 1e-4),
-}
-
-
-def camera(
-    lens: str = "pinhole", focal: float = 1000.0, centre: float = 256.0, away: float = 0.0
-) -> Camera:
-    """A turned camera of 512² pixels, at a distance from the origin; float32 can hold its numbers.
-
-    Args:
-        lens: one of `LENSES`.
-        focal: pixels.
-        centre: both coordinates of the principal point, pixels.
-        away: metres along the diagonal.
-    """
-    K = torch.tensor([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
-    R = axis_angle_to_rotmat(torch.tensor([0.3, -0.7, 0.2]))
-    t = torch.tensor([0.1, -0.2, 0.5]) - R @ torch.full((3,), away)
-    coefficients = torch.tensor(LENSES[lens])
-    return Camera(K.double(), R.double(), t.double(), (512, 512), coefficients.double())
 
 
 def _ahead(camera: Camera, depth: tuple[float, float], spread: float) -> Make:
@@ -57,19 +31,6 @@ def _ahead(camera: Camera, depth: tuple[float, float], spread: float) -> Make:
 
 
 # --- oracles -----------------------------------------------------------------------------------
-
-
-def exact_lens(camera: Camera, plane: np.ndarray) -> np.ndarray:
-    """Brown and Conrady's lens up to the fold, in proportion beyond it."""
-    limit = min(camera.fold_radius, 1e3) if camera.is_distorted else math.inf
-    stretch = np.maximum(np.linalg.norm(plane, axis=1) / limit, 1.0)
-    x, y = (plane / stretch[:, None]).T
-    k = [*camera.distortion.tolist(), *[0.0] * 12][:12]
-    r = x * x + y * y
-    radial = (1 + k[0] * r + k[1] * r**2 + k[4] * r**3) / (1 + k[5] * r + k[6] * r**2 + k[7] * r**3)
-    u = x * radial + 2 * k[2] * x * y + k[3] * (r + 2 * x * x) + k[8] * r + k[9] * r**2
-    v = y * radial + k[2] * (r + 2 * y * y) + 2 * k[3] * x * y + k[10] * r + k[11] * r**2
-    return np.stack((u, v), 1) * stretch[:, None]
 
 
 def exact_pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -91,6 +52,9 @@ def _pixel_scale(camera: Camera, exact: np.ndarray, points: np.ndarray) -> np.nd
     slope = np.linalg.norm(local[:, :2], axis=1) / z
     bent = np.linalg.norm(exact - camera.K.numpy()[:2, 2], axis=1) / float(camera.K[0, 0])
     carried = float(camera.K[0, 0]) * largest / z * (1 + np.maximum(slope, bent))
+    if camera.distortion.numel() == 14:  # the horizon of a tilt stretches without bound
+        moved = [exact_pixels(camera, points + 1e-7 * axis) - exact for axis in np.eye(3)]
+        carried = np.maximum(carried, largest * np.linalg.norm(moved, axis=(0, 2)) / 1e-7)
     return np.maximum(np.maximum(carried, np.abs(exact).max(1)), 512.0)
 
 
@@ -108,6 +72,10 @@ def _opencv(camera: Camera, points: Tensor) -> Tensor:
     lens = like.distortion.double().numpy() if like.is_distorted else None
     local = (points @ like.R.mT + like.t).numpy()[:, None]  # its rotation vectors would round R
     still = np.zeros(3)
+    if like.lens == "fisheye":
+        project = cv2.fisheye.projectPoints
+        found = project(local.astype(np.float64), still, still, like.K.double().numpy(), lens)[0]
+        return torch.from_numpy(found.reshape(-1, 2))
     found = cv2.projectPoints(local, still, still, like.K.double().numpy(), lens)[0]
     return torch.from_numpy(found[:, 0])
 
@@ -118,12 +86,12 @@ def _project_families() -> tuple[Family, ...]:
     out = [
         Family("3 m", _ahead(plain, (2.0, 4.0), 0.3), extra=plain, step=1e-6),
         Family("depth 1e-2", _ahead(plain, (1e-2, 2e-2), 0.3), extra=plain, step=1e-8),
-        Family("depth 1e-5", _ahead(plain, (1e-5, 2e-5), 0.3), extra=plain, step=1e-11, slope=0.1),
+        Family("depth 1e-5", _ahead(plain, (1e-5, 2e-5), 0.3), extra=plain, step=1e-11),
         Family("depth 0", _ahead(plain, (0.0, 0.0), 0.3), extra=plain, smooth=False),
         Family("behind", _ahead(plain, (-4.0, -1e-3), 0.3), extra=plain),
         Family("1 km", _ahead(plain, (900.0, 1100.0), 0.3), extra=plain, step=1e-3),
-        Family("89.9° off axis", grazing, extra=plain, step=1e-6, slope=1e-3),
-        Family("100 km away", _ahead(far, (2.0, 4.0), 0.3), extra=far, step=1e-4, slope=0.1),
+        Family("89.9° off axis", grazing, extra=plain, step=1e-6),
+        Family("100 km away", _ahead(far, (2.0, 4.0), 0.3), extra=far, step=1e-4),
     ]
     for name, one in (
         *(("focal 1", camera(focal=1.0)), ("focal 1e6", camera(focal=1e6))),
@@ -135,6 +103,11 @@ def _project_families() -> tuple[Family, ...]:
         out.append(Family(lens, _ahead(one, (2.0, 4.0), 0.4), extra=one, step=1e-6))
         beyond = _ahead(one, (0.2, 0.4), 20.0)
         out.append(Family(f"{lens}, beyond", beyond, extra=one, step=1e-7, smooth=False))
+    for lens in ("usual lens", "fisheye"):
+        still = camera(lens)  # at the origin: a turn would round depths away
+        one = dataclasses.replace(still, R=torch.eye(3).double(), t=torch.zeros(3).double())
+        beside = _ahead(one, (1e-5, 2e-5), 1e20)
+        out.append(Family(f"{lens}, 1e15 m beside", beside, extra=one, smooth=False))
     return tuple(out)
 
 
@@ -190,7 +163,7 @@ def _rays() -> Stress:
         ("principal point outside", camera(centre=-5000.0), 5.0, False),
     ):
         step = 1e-6 * float(one.K[0, 0])
-        families.append(Family(name, _image(one, reach, special), extra=one, step=step, slope=1e-3))
+        families.append(Family(name, _image(one, reach, special), extra=one, step=step))
     return Stress(
         name="rays",
         title="rays of a pinhole",
@@ -204,7 +177,7 @@ def _rays() -> Stress:
 
 def _back(camera: Camera, plane: Tensor) -> Tensor:
     """Ideal points to pixels in float64."""
-    bent = distort_extended(plane.double(), camera.distortion, camera.fold_radius)
+    bent = lens_distort(camera.lens, plane.double(), camera.distortion, camera.fold_radius)
     return bent @ camera.K[:2, :2].mT + camera.K[:2, 2]
 
 
@@ -224,6 +197,10 @@ def _opencv_undistort(camera: Camera, pixels: Tensor) -> Tensor:
     cv2 = load("cv2")
     stop = (cv2.TERM_CRITERIA_COUNT, 20, 0.0)
     K, lens = camera.K.numpy(), camera.distortion.numpy()
+    if camera.lens == "fisheye":
+        undistort = cv2.fisheye.undistortPoints
+        found = undistort(pixels.double().numpy()[:, None], K, lens, criteria=stop)
+        return _back(camera, torch.from_numpy(np.asarray(found)[:, 0]))
     found = cv2.undistortPoints(pixels.numpy()[:, None], K, lens, R=None, P=None, criteria=stop)
     return _back(camera, torch.from_numpy(np.asarray(found)[:, 0]))
 
@@ -249,7 +226,12 @@ def _undistort() -> Stress:
         families=tuple(families),
         ways=(
             Way("monopart", _our_undistort, True),
-            Way("kornia, 20 steps", _kornia_undistort, modules=("kornia",)),
+            Way(
+                "kornia, 20 steps",
+                _kornia_undistort,
+                modules=("kornia",),
+                serves=lambda family: family.extra.lens == "brown",
+            ),
             Way("OpenCV, 20 steps", _opencv_undistort, modules=("cv2",), differentiable=False),
         ),
         exact=lambda cam, pixels: pixels,

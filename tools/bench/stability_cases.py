@@ -36,8 +36,6 @@ class Family:
     """Only in exhaustive runs; ``extra`` is a function that makes it then."""
     halves: bool = True
     """Inside the range of float16 too."""
-    slope: float = 1e-4
-    """Largest relative error of a float32 gradient; the tests hold it."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +101,20 @@ class Stress:
 
 
 @dataclass(frozen=True)
+class Slopes:
+    """What was found of gradients."""
+
+    error: float | None = None
+    """Largest error of the gradient: against float64, or of float64 against differences."""
+    spread: float | None = None
+    """The same of the exact gradient where each input is moved by one last place."""
+    amplification: float | None = None
+    """Largest |gradient| times |input| over |result|: what a relative error is multiplied by."""
+    bad: int = 0
+    """Rows (or entries) of gradients that are not finite."""
+
+
+@dataclass(frozen=True)
 class Cell:
     """One implementation on one family in one precision."""
 
@@ -120,16 +132,22 @@ class Cell:
     """Largest error relative to the scale."""
     absolute: float | None
     """Largest error in the unit of the result."""
-    gradient: float | None
-    """Largest error of the gradient: against float64, or of float64 against differences."""
-    amplification: float | None
-    """Largest |gradient| times |input| over |result|: a bound on what rounding can do."""
+    slopes: Slopes
+    """Of the gradients."""
     bad_values: int
     """Rows that are not finite and not masked."""
-    bad_gradients: int
-    """Rows (or entries) of gradients that are not finite."""
     raised: str = ""
     """The error that stopped it, if any."""
+
+    @property
+    def gradient(self) -> float | None:
+        """Largest error of the gradient."""
+        return self.slopes.error
+
+    @property
+    def bad_gradients(self) -> int:
+        """Gradients that are not finite."""
+        return self.slopes.bad
 
     @property
     def kind(self) -> torch.dtype:
@@ -140,6 +158,13 @@ class Cell:
     def ulp(self) -> float | None:
         """The value error in units of the last place of the scale."""
         return None if self.value is None else self.value / torch.finfo(self.kind).eps
+
+    def as_dict(self) -> dict[str, Any]:
+        """All figures, flat, as JSON takes them."""
+        slopes = {"gradient": self.gradient, "gradient_spread": self.slopes.spread}
+        slopes |= {"amplification": self.slopes.amplification, "bad_gradients": self.slopes.bad}
+        kept = {k: v for k, v in vars(self).items() if k != "slopes"}
+        return kept | slopes | {"ulp": self.ulp}
 
 
 @dataclass

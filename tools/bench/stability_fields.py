@@ -85,7 +85,7 @@ def _grids() -> Stress:
     usual = _grid()
     # weights of corners far from a point are small differences: their gradients lose digits
     families = [
-        Family(k, _in_cube(usual, k), extra=usual, smooth=k == "inside", step=1e-9, slope=1e-2)
+        Family(k, _in_cube(usual, k), extra=usual, smooth=k == "inside", step=1e-9)
         for k in ("inside", "borders", "next to borders", "corners", "outside", "infinite", "1e-30")
     ]
     for name, grid in (
@@ -96,7 +96,7 @@ def _grids() -> Stress:
         # in float32 a place on 65536 cells has 8 bits of its cell left: the slope is a neighbour's
         smooth = name != "65536 cells"
         made = _in_cube(grid, "inside")
-        families.append(Family(name, made, extra=grid, step=1e-10, smooth=smooth, slope=1e-2))
+        families.append(Family(name, made, extra=grid, step=1e-10, smooth=smooth))
     return Stress(
         name="hash_grid",
         title="hash grid",
@@ -149,14 +149,15 @@ def _frequency() -> Stress:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Nets:
+class Nets:
     """One module in both precisions."""
 
     single: Any
     double: Any
 
     @classmethod
-    def of(cls, make: Callable[[], torch.nn.Module]) -> "_Nets":
+    def of(cls, make: Callable[[], torch.nn.Module]) -> "Nets":
+        """A module with numbers of size one, in float32 and the same ones in float64."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(3)
             single, double = make(), make().double()
@@ -166,10 +167,11 @@ class _Nets:
         return cls(single, double)
 
     def like(self, ref: Tensor) -> Any:
+        """The module in the precision of a tensor."""
         return self.double if ref.dtype == DOUBLE else self.single
 
 
-def _layers(mlp: PartMLP, x: np.ndarray) -> np.ndarray:
+def exact_layers(mlp: PartMLP, x: np.ndarray) -> np.ndarray:
     """Layers by matrix products in float64."""
     last = len(mlp.weights) - 1
     for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
@@ -178,7 +180,7 @@ def _layers(mlp: PartMLP, x: np.ndarray) -> np.ndarray:
     return x
 
 
-def _half_products(nets: _Nets, x: Tensor) -> Tensor:
+def _half_products(nets: Nets, x: Tensor) -> Tensor:
     """The products in float16, as a fast renderer takes them."""
     nets.single.compute = torch.float16
     try:
@@ -188,7 +190,7 @@ def _half_products(nets: _Nets, x: Tensor) -> Tensor:
 
 
 def _networks() -> Stress:
-    nets = _Nets.of(lambda: PartMLP(1, (32, 64, 64, 16)))
+    nets = Nets.of(lambda: PartMLP(1, (32, 64, 64, 16)))
     families = [
         Family(f"|x| {s:g}", _normal(s, 32), extra=nets, step=1e-7 * max(s, 1e-3), smooth=s < 1e20)
         for s in (0.0, 1e-30, 1.0, 1e3, 1e30)
@@ -209,7 +211,7 @@ def _networks() -> Stress:
         error="largest entry of result and inputs, at least 1",
         families=tuple(families),
         ways=(Way("monopart", lambda nets, x: nets.like(x)(x), True), half),
-        exact=lambda nets, x: _layers(nets.double, x),
+        exact=lambda nets, x: exact_layers(nets.double, x),
         scale=lambda nets, exact, x: np.maximum(np.abs(exact).max(1), max(1.0, np.abs(x).max())),
     )
 
@@ -229,17 +231,17 @@ def _coordinates(kind: str) -> Make:
 
 
 def _residual() -> Stress:
-    def run(nets: _Nets, x: Tensor) -> Tensor:
+    def run(nets: Nets, x: Tensor) -> Tensor:
         return nets.like(x)(x, torch.zeros(len(x), dtype=torch.long), (len(x),))
 
-    def exact(nets: _Nets, x: np.ndarray) -> np.ndarray:
+    def exact(nets: Nets, x: np.ndarray) -> np.ndarray:
         field = nets.double
         encoded = exact_grid(field.grid, x, field.grid.table.detach().numpy())
-        return field.scale * np.tanh(_layers(field.mlp, np.concatenate((encoded, x), 1)))
+        return field.scale * np.tanh(exact_layers(field.mlp, np.concatenate((encoded, x), 1)))
 
-    nets = _Nets.of(lambda: ResidualField(1))
+    nets = Nets.of(lambda: ResidualField(1))
     families = [
-        Family(k, _coordinates(k), extra=nets, smooth=k == "inside", step=1e-8, slope=1e-3)
+        Family(k, _coordinates(k), extra=nets, smooth=k == "inside", step=1e-8)
         for k in ("inside", "0 and 1", "outside", "1e6")
     ]
     return Stress(
@@ -340,4 +342,7 @@ def _prior() -> Stress:
 
 def stresses() -> list[Stress]:
     """Operations on encodings, networks and grids."""
-    return [_grids(), _frequency(), _networks(), _residual(), _occupancy(), _prior()]
+    from . import stability_learned
+
+    own = [_grids(), _frequency(), _networks(), _residual(), _occupancy(), _prior()]
+    return [*own, *stability_learned.stresses()]

@@ -182,7 +182,7 @@ def _to_rotmat() -> Stress:
     more = (
         Family("2π", turned(2 * np.pi)),
         # an angle is held to its last place: 6e-4 rad here, of gradients that may be small
-        Family("10-1e4", turned((10.0, 1e4)), step=1e-6, slope=1.0, halves=False),
+        Family("10-1e4", turned((10.0, 1e4)), step=1e-6, halves=False),
         Family("1e-30", turned(1e-30)),
         Family("1e25", turned(1e25), inside=False),
         Family("NaN", lambda g, n: (torch.full((n, 3), torch.nan, dtype=DOUBLE),), inside=False),

@@ -108,7 +108,6 @@ def _kinematics() -> Stress:
             _skeleton(parents, bone, angle, away),
             extra=KinematicTree(parents),
             step=1e-7,
-            slope=0.1 if away else 1e-4,
         )
         for name, parents, bone, angle, away in shapes
     )

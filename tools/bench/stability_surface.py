@@ -39,7 +39,7 @@ def _surface_families() -> tuple[Family, ...]:
     whole, cube = ball(), box()
     # a barycentric next to 0 has an absolute error: so has the gradient of that corner
     out = [
-        Family("3 cm off", near(whole, 0.03), extra=whole.faces, step=1e-8, slope=2e-2),
+        Family("3 cm off", near(whole, 0.03), extra=whole.faces, step=1e-8),
         Family("1 µm off", near(whole, 1e-6), extra=whole.faces, smooth=False),
         Family("on faces", near(whole, 0.0), extra=whole.faces, smooth=False),
         Family("on edges", near(whole, 0.0, "edge"), extra=whole.faces, smooth=False),
@@ -73,7 +73,6 @@ def _surface_families() -> tuple[Family, ...]:
                 extra=mesh.faces,
                 step=1e-8 * size,
                 smooth=not away,
-                slope=2e-2,
             )
         )
     for gap in (1e3, 1e6):
