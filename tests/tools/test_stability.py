@@ -139,7 +139,7 @@ def test_the_command_writes_tables_maps_and_json(tmp_path: Path) -> None:
     assert text.startswith("before\n") and text.endswith("after\n") and "\nold\n" not in text
     assert "quaternion to matrix" in text and "\\|det\\|" in text
     data = json.loads((tmp_path / "out" / "stability.json").read_text())
-    assert data["schema"] == 1 and data["cases"] == sum(c["cases"] for c in data["cells"])
+    assert data["schema"] == 2 and data["cases"] == sum(c["cases"] for c in data["cells"])
     assert {c["operation"] for c in data["cells"]} == {"quat_wxyz_to_rotmat", "invert_affine"}
     for folder in (tmp_path / "page", tmp_path / "out" / "stability"):
         root = ElementTree.parse(folder / "rotations.svg").getroot()

@@ -46,7 +46,10 @@ def _signed() -> Stress:
     whole, cube = ball(), box()
     shapes = (
         *(("outside", near(whole, 0.03), whole), ("1e-5 m off", near(whole, 1e-5), whole)),
-        *(("on faces", near(whole, 0.0), whole), ("on vertices", near(whole, 0, "vertex"), whole)),
+        *(
+            ("on faces", near(whole, 0.0), whole),
+            ("on vertices", near(whole, 0.0, "vertex"), whole),
+        ),
         ("in a cube", at(cube, lambda g, n: torch.rand(n, 3, generator=g).double() - 0.5), cube),
         ("1e6 m off", near(whole, 1e6), whole),
         ("infinite", at(whole, lambda g, n: torch.full((n, 3), torch.inf).double()), whole),
