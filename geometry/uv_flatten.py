@@ -205,7 +205,7 @@ def lscm_map(cut: CutMesh, verts: Float[np.ndarray, "V 3"]) -> Float[np.ndarray,
 
 
 def arap_map(cut: CutMesh, verts: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "W 2"]:
-    """As-rigid-as-possible maps by libigl, from the harmonic one; may flip faces.
+    """As-rigid-as-possible maps, from the harmonic one; may flip faces.
 
     Args:
         cut: the cut mesh; every chart is a disc.
@@ -217,17 +217,29 @@ def arap_map(cut: CutMesh, verts: Float[np.ndarray, "V 3"]) -> Float[np.ndarray,
     Reference:
         Liu et al. 2008, A local/global approach to mesh parameterization.
     """
-    import igl
+    from scipy.sparse import diags
 
+    flat = flat_triangles(verts, cut.edges.faces)
+    rest = np.concatenate([np.zeros((len(flat), 1, 2)), flat.transpose(0, 2, 1)], 1)
+    side = np.roll(rest, -1, 1) - rest
+    weight = corner_weights(flat, "cotangent")[..., 0]
+    matrix = laplacian(cut, flat, "cotangent")
+    hold = 1e-8 * np.abs(matrix.diagonal()).mean()
+    factors = factorised((matrix + diags(np.full(len(cut.origin), hold))).tocsc())
     uv = harmonic_map(cut, verts)
-    for chart in range(cut.num_charts):
-        used, places, faces = disc_of(cut, chart, verts)
-        data = igl.ARAPData()
-        data.energy = igl.ARAPEnergyType.ARAP_ENERGY_TYPE_SPOKES_AND_RIMS
-        data.max_iter = _ARAP_STEPS
-        held = np.zeros(1, np.int64)
-        igl.arap_precomputation(places, faces.astype(np.int64), 2, held, data)
-        uv[used] = igl.arap_solve(uv[used][:1], data, np.asfortranarray(uv[used]))
+    for _ in range(_ARAP_STEPS):
+        now = np.roll(uv[cut.faces], -1, 1) - uv[cut.faces]
+        cross = np.einsum("fk,fki,fkj->fij", weight, now, side)
+        # the nearest rotation in the plane, by the angle of the conformal part
+        angle = np.arctan2(cross[:, 1, 0] - cross[:, 0, 1], cross[:, 0, 0] + cross[:, 1, 1])
+        cos, sin = np.cos(angle), np.sin(angle)
+        turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+        pull = weight[..., None] * np.einsum("fij,fkj->fki", turn, side)
+        right = hold * uv
+        for axis in range(2):
+            values = np.roll(pull[..., axis], 1, 1) - pull[..., axis]
+            right[:, axis] += np.bincount(cut.faces.reshape(-1), values.reshape(-1), len(uv))
+        uv = factors.solve(right)
     return uv
 
 

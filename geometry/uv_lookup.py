@@ -15,7 +15,7 @@ _CHUNK = 2_000_000
 
 @dataclass(frozen=True, eq=False)
 class UVHit:
-    """Where points of the texture lie on the surface; has `.face` and `.bary` as `UVMap.at` asks."""
+    """Where points of the texture lie on the surface; what `UVMap.at` asks for."""
 
     face: Int[Tensor, "n"]
     """Face index; −1 between the charts."""

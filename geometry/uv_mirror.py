@@ -24,7 +24,7 @@ def mirrored_edges(surface: Surface, some: Int[np.ndarray, "n"]) -> Int[np.ndarr
     base = len(surface.verts)
     known = surface.edges.verts[:, 0] * base + surface.edges.verts[:, 1]
     there = np.isin(image[:, 0] * base + image[:, 1], known)
-    pairs = [image[there], *(_way_around(surface, a, b) for a, b in image[~there])]
+    pairs = [image[there], *(_way_around(surface, a, b) for a, b in image[~there].tolist())]
     return edge_index(surface.edges, np.concatenate(pairs))
 
 

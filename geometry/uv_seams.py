@@ -81,8 +81,8 @@ def mirror_of(
         faces: vertex indices.
 
     Returns:
-        Vertex indices and the signed distance of each vertex from the plane, or None where no plane brings 95 % of the vertices onto others (to a tenth
-        of the mean edge).
+        Vertex indices and the signed distance of each vertex from the plane, or None where no
+        plane brings 95 % of the vertices onto others (to a tenth of the mean edge).
     """
     from scipy.spatial import cKDTree
 
@@ -293,9 +293,9 @@ def _handles(surface: Surface, cut: CutMesh, bad: Bool[np.ndarray, "C"]) -> np.n
     # a tree over the faces that takes the longest loops first, so the shortest remain to be cut
     pairs = np.sort(edges.face_pairs[inner[free]], 1)
     order = np.lexsort((-loop[free], pairs[:, 1], pairs[:, 0]))
-    first = np.ones(len(order), bool)
-    first[1:] = (np.diff(pairs[order], axis=0) != 0).any(1)
-    chosen = order[first]
+    lead = np.ones(len(order), bool)
+    lead[1:] = (np.diff(pairs[order], axis=0) != 0).any(1)
+    chosen = order[lead]
     count = len(edges.faces)
     weight = 2 * loop[free].max(initial=1.0) - loop[free][chosen]
     rows = (pairs[chosen, 0], pairs[chosen, 1])
