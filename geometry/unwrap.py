@@ -143,6 +143,7 @@ def _checked(options: UnwrapOptions) -> Any:
             f"size, margin: expected 16 texels or more and a margin of at most a sixteenth, found "
             f"{chosen['size']} and {chosen['margin']}; enlarge the texture"
         )
+    chosen["margin"] = float(chosen["margin"])
     if chosen["chart_share"] is None:
         chosen["chart_share"] = min(1.0, 0.06 * ((chosen["target"] - 4) / 0.03) ** 0.75)
     elif not 0 < chosen["chart_share"] <= 1:
