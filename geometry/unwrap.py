@@ -73,7 +73,7 @@ def unwrap(
     verts: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
     *,
-    parts: Int[Tensor, "F"] | None = None,
+    parts: Int[Tensor, "P"] | None = None,
     progress: Callable[[str, float], None] | None = None,
     **options: Unpack[UnwrapOptions],
 ) -> UVLayout:
@@ -85,7 +85,7 @@ def unwrap(
     Args:
         verts: vertices, metres, finite.
         faces: vertex indices.
-        parts: label of each face; no chart crosses from one to another.
+        parts: label of each face, (F); no chart crosses from one to another.
         progress: called with the name of a stage and the share of it that is done.
         **options: `UnwrapOptions`: target 4.03, method "slim", engine "monopart", size 2048,
             margin 4, symmetric True, max_charts None, chart_share None.
