@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .errors import InputError
 from .uv import UVMap
-from .uv_report import UVReport, report_of_arrays
+from .uv_measure import UVReport, report_of_arrays
 
 Method = Literal["slim", "arap", "lscm", "harmonic"]
 Engine = Literal["monopart", "xatlas"]

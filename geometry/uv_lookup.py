@@ -137,8 +137,8 @@ def transfer_uv(
     Raises:
         InputError: maps and faces of different number.
     """
+    from .uv_measure import seams_of_layout
     from .uv_mesh import MeshEdges, components
-    from .uv_report import seams_of_layout
 
     if len(uv.corner_uv) != len(faces):
         raise InputError(

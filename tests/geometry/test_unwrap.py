@@ -14,9 +14,9 @@ from monopart.geometry.errors import InputError
 from monopart.geometry.parts import PartMap
 from monopart.geometry.unwrap import GRID, UVLayout, unwrap
 from monopart.geometry.uv_energy import face_energy, newton_terms
+from monopart.geometry.uv_measure import uv_report
 from monopart.geometry.uv_mesh import CutMesh, MeshEdges
 from monopart.geometry.uv_overlap import face_signs, orientation, overlapping_pairs
-from monopart.geometry.uv_report import uv_report
 from monopart.geometry.uv_seams import Surface, cut_to_discs
 
 
