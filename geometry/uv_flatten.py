@@ -110,14 +110,12 @@ def harmonic_map(
     ring = np.flatnonzero(cut.loop >= 0)
     right = -(matrix[:, ring] @ uv[ring])
     inner = matrix[:, inside].tocsc()
-    uv[inside] = _solve(inner, right, kind == "mean_value")
+    uv[inside] = _solve(inner, right)
     return uv
 
 
-def _solve(matrix: Any, right: np.ndarray, general: bool) -> np.ndarray:
-    from scipy.sparse.linalg import splu
-
-    factors = splu(matrix) if general else factorised(matrix)
+def _solve(matrix: Any, right: np.ndarray) -> np.ndarray:
+    factors = factorised(matrix)
     out = factors.solve(right)
     # one correction: what is left of the residual decides whether tiny triangles flip
     return out + factors.solve(right - matrix @ out)

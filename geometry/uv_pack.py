@@ -10,6 +10,8 @@ from .errors import InputError
 _TURNS = 12
 _COARSE, _FINE = 128, 384
 _TRIALS = 24
+_FREE, _MANY = 60, 150
+"""Up to the first number of charts all orders are tried; above the second boxes go on shelves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +47,8 @@ def packed(
 ) -> Packing:
     """Pack charts into the unit square at one common scale.
 
-    Many orders are tried on a coarse grid; the best one is repeated on a fine grid.
+    Many orders are tried on a coarse grid; the best one is repeated on a fine grid. More than 150
+    charts go on shelves, box by box: looser, but in a time that grows with their number alone.
 
     Args:
         corner: coordinates per face corner, each chart in a plane of its own.
@@ -61,6 +64,8 @@ def packed(
     area = np.abs(side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0]) / 2
     sizes = np.bincount(chart, area, minlength=count)
     faces = [corner[rows] for rows in _rows_of(chart, count)]
+    if count > _MANY:
+        return _shelved(faces, margin / size)
     coarse = _Board.of(faces, sizes, _COARSE, margin * _COARSE / size, _TURNS)
     width, recipe = _searched(coarse, sizes)
     fine = int(np.clip(size // 2, 2 * _COARSE, _FINE))
@@ -73,14 +78,63 @@ def _rows_of(chart: np.ndarray, count: int) -> list[np.ndarray]:
     return np.split(order, np.searchsorted(chart[order], np.arange(1, count)))
 
 
+def _shelved(faces: list[np.ndarray], gap: float) -> Packing:
+    """Charts in their smallest boxes, the tallest first, in rows from the bottom."""
+    turns, lows, boxes = [], [], []
+    for corner in faces:
+        angle = _level_angle(corner.reshape(-1, 2))
+        turned = corner.reshape(-1, 2) @ _rotation(angle).T
+        if np.ptp(turned[:, 1]) > np.ptp(turned[:, 0]):
+            angle += np.pi / 2
+            turned = corner.reshape(-1, 2) @ _rotation(angle).T
+        turns.append(_rotation(angle))
+        lows.append(turned.min(0))
+        boxes.append(np.ptp(turned, axis=0))
+    box = np.array(boxes)
+    order = np.argsort(-box[:, 1], kind="stable")
+    # so many boxes can have a margin each that nothing is left: then the margin gives way
+    gap = min(max(gap, 1e-6), 0.25 / np.ceil(np.sqrt(len(faces))))
+    low, high = 0.0, 1 / max(float(np.sqrt(box.prod(1).sum())), float(box.max()), 1e-300)
+    places = None
+    for _ in range(40):
+        middle = (low + high) / 2
+        trial = _on_shelves(box[order] * middle + gap)
+        if trial is None:
+            high = middle
+        else:
+            low, places = middle, trial
+    if places is None:
+        raise InputError("charts: expected charts that fit a square, found none that do")
+    shift = np.zeros((len(faces), 2))
+    shift[order] = places + gap / 2
+    return Packing(low, np.stack(turns), shift - low * np.array(lows))
+
+
+def _on_shelves(box: np.ndarray) -> np.ndarray | None:
+    """Lower left corners of boxes of falling height in the unit square; None if they do not fit."""
+    out, at, bottom, top = [], 0.0, 0.0, 0.0
+    for wide, tall in box.tolist():
+        if at + wide > 1:
+            at, bottom, top = 0.0, top, top
+        if at + wide > 1 or bottom + tall > 1:
+            return None
+        top = max(top, bottom + tall)
+        out.append((at, bottom))
+        at += wide
+    return np.array(out)
+
+
+def _rotation(angle: float) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
 def _stamps(corner: np.ndarray, gap: float, turns: np.ndarray, count: int) -> list[Stamp]:
     """A chart in some of so many turns; turn 0 has its long side level or upright."""
     base = _level_angle(corner.reshape(-1, 2))
     out = []
     for k in turns:
-        angle = base + 2 * np.pi * k / count
-        cos, sin = np.cos(angle), np.sin(angle)
-        turn = np.array([[cos, -sin], [sin, cos]])
+        turn = _rotation(base + 2 * np.pi * k / count)
         mask, low = coverage(corner @ turn.T, gap)
         mask = np.pad(mask, 1)
         near = mask.copy()
@@ -278,7 +332,7 @@ def _searched(board: _Board, sizes: np.ndarray) -> tuple[int, _Recipe]:
     random = np.random.default_rng(0)
     extent = np.array([max(own[0].mask.shape) for own in board.stamps], float)
     best: tuple[int, _Recipe] | None = None
-    for trial in range(_TRIALS):
+    for trial in range(max(6, min(_TRIALS, _TRIALS * _FREE // len(sizes)))):
         measure = sizes if trial % 2 else extent**2
         noise = np.exp((0.0 if trial < 6 else 0.35) * random.standard_normal(len(sizes)))
         order = np.argsort(-measure * noise, kind="stable")
