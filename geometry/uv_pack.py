@@ -115,7 +115,7 @@ def _on_shelves(box: np.ndarray) -> np.ndarray | None:
     out, at, bottom, top = [], 0.0, 0.0, 0.0
     for wide, tall in box.tolist():
         if at + wide > 1:
-            at, bottom, top = 0.0, top, top
+            at, bottom = 0.0, top
         if at + wide > 1 or bottom + tall > 1:
             return None
         top = max(top, bottom + tall)
