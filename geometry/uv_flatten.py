@@ -170,7 +170,7 @@ def slim_start(
             np.zeros((0, 2), order="F"),
             0.0,
         )
-        found = igl.slim_solve(data, _SLIM_START)[:, :2]
+        found = np.asarray(igl.slim_solve(data, _SLIM_START))[:, :2]
         jacobian = RestShape.of(places, faces).jacobians(found[faces])
         if np.isfinite(found).all() and (np.linalg.det(jacobian) > 0).all():
             out[used] = found
@@ -198,7 +198,7 @@ def lscm_map(cut: CutMesh, verts: Float[np.ndarray, "V 3"]) -> Float[np.ndarray,
         held = np.array([first, far], np.int64)
         gap = max(float(np.linalg.norm(places[far] - places[first])), 1e-30)
         found, _ = igl.lscm(places, faces.astype(np.int64), held, np.array([[0.0, 0], [gap, 0]]))
-        uv[used] = _to_area(found, places, faces)
+        uv[used] = _to_area(np.asarray(found), places, faces)
     return uv
 
 

@@ -102,6 +102,7 @@ class NewtonSolver:
         length = np.full(self.num_charts, np.inf)
         np.minimum.at(length, self.chart, limit)
         length = np.minimum(1.0, _LARGEST_STEP * length)
+        worse = np.zeros(self.num_charts, bool)
         for _ in range(_TRIES):
             trial = uv + length[self.vert_chart, None] * step
             after = self.energies(trial)

@@ -1,6 +1,7 @@
 """Packing of charts into the unit square: turned, rasterised, put where they touch the most."""
 
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -249,14 +250,15 @@ class _Board:
 
     def placed(self, recipe: _Recipe, width: int) -> list[tuple[int, int, int]] | None:
         """Turn, row and column of each chart in a square of some cells; None if they do not fit."""
-        from scipy.fft import fft2, ifft2
+        from scipy import fft
 
         taken = np.ones((self.canvas, self.canvas), bool)
         taken[1 : width - 1, 1 : width - 1] = False
         places: list[tuple[int, int, int]] = [(0, 0, 0)] * len(self.stamps)
         for chart in recipe.order:
             stamps = self.stamps[chart]
-            hits = ifft2(fft2(taken.astype(np.complex64)) * self.spectra[chart])
+            spectrum = np.asarray(fft.fft2(taken.astype(np.complex64)))
+            hits = np.asarray(fft.ifft2(spectrum * self.spectra[chart]))
             best, found = -8.0, None
             for which, stamp in enumerate(stamps):
                 if recipe.goals is None:
@@ -291,7 +293,7 @@ def _spectra(stamps: list[Stamp], canvas: int) -> np.ndarray:
     for own, stamp in zip(both, stamps, strict=True):
         height, width = stamp.mask.shape
         own[:height, :width] = stamp.mask + 1j * stamp.rim
-    return np.conj(fft2(both))
+    return np.conj(np.asarray(fft2(both)))
 
 
 def _worth(hits: np.ndarray, stamp: Stamp, width: int, bias: float) -> np.ndarray:
@@ -301,12 +303,12 @@ def _worth(hits: np.ndarray, stamp: Stamp, width: int, bias: float) -> np.ndarra
         return np.zeros((0, 0))
     hits = hits[: width - height + 1, : width - wide + 1]
     # conj(F(mask + i rim)) · F(taken) gives hits − i contacts
-    contact = -hits.imag / stamp.rim.sum()
+    contact = -np.imag(hits) / stamp.rim.sum()
     if bias:
         row, column = np.arange(hits.shape[0])[:, None], np.arange(hits.shape[1])[None]
         far = np.maximum(row + height, column + wide) / width
         contact = contact - np.float32(bias) * far.astype(np.float32)
-    return np.where(hits.real < 0.5, contact, np.float32(-9.0))
+    return np.where(np.real(hits) < 0.5, contact, np.float32(-9.0))
 
 
 def _nearness(hits: np.ndarray, stamp: Stamp, width: int, goal: np.ndarray) -> np.ndarray:
@@ -317,14 +319,14 @@ def _nearness(hits: np.ndarray, stamp: Stamp, width: int, goal: np.ndarray) -> n
     hits = hits[: width - height + 1, : width - wide + 1]
     column, row = goal * width + stamp.low
     away = np.hypot(np.arange(len(hits))[:, None] - row, np.arange(hits.shape[1])[None] - column)
-    contact = -hits.imag / stamp.rim.sum()
-    return np.where(hits.real < 0.5, 0.3 * contact - 4 * away / width, -9.0)
+    contact = -np.imag(hits) / stamp.rim.sum()
+    return np.where(np.real(hits) < 0.5, 0.3 * contact - 4 * away / width, -9.0)
 
 
 def _round_up(number: int) -> int:
     from scipy.fft import next_fast_len
 
-    return int(next_fast_len(number))
+    return int(cast(Any, next_fast_len)(number))
 
 
 def _searched(board: _Board, sizes: np.ndarray) -> tuple[int, _Recipe]:

@@ -84,7 +84,7 @@ def mirror_of(
         Vertex indices and the signed distance of each vertex from the plane, or None where no
         plane brings 95 % of the vertices onto others (to a tenth of the mean edge).
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if len(faces) == 0:
         return None
@@ -92,7 +92,7 @@ def mirror_of(
     points = verts[used]
     edge = np.linalg.norm(verts[faces[:, 0]] - verts[faces[:, 1]], axis=-1).mean()
     middle = (points.min(0) + points.max(0)) / 2
-    tree = cKDTree(points)
+    tree = KDTree(points)
     for axis in range(3):
         flipped = points.copy()
         flipped[:, axis] = 2 * middle[axis] - flipped[:, axis]
@@ -210,11 +210,11 @@ def _sphere_slits(surface: Surface, cut: CutMesh) -> np.ndarray:
     graph = surface.graph(cut)
     spheres = np.flatnonzero(cut.euler == 2)
     start = _first_of(cut.vert_chart, cut.num_charts)[spheres]
-    for _ in range(2):
-        distance, before = _shortest(graph, start)
-        ends, start = start, _farthest(distance, cut.vert_chart, cut.num_charts)[spheres]
-    del ends
-    return path_edges(surface, cut, before, start)
+    distance, _ = _shortest(graph, start)
+    begin = _farthest(distance, cut.vert_chart, cut.num_charts)[spheres]
+    distance, before = _shortest(graph, begin)
+    end = _farthest(distance, cut.vert_chart, cut.num_charts)[spheres]
+    return path_edges(surface, cut, before, end)
 
 
 def _farthest(distance: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:

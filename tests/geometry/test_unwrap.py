@@ -178,7 +178,7 @@ def test_a_singular_matrix_is_held(share: float) -> None:
     matrix = np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, share]])
     found = factorised(csc_matrix(matrix)).solve(np.array([1.0, -1.0, 0.0]))
     assert np.isfinite(found).all() and abs(found[0] - found[1] - 1) < 1e-3
-    with pytest.raises(InputError, match="finite|float64"):
+    with pytest.raises(InputError, match="float64"):
         factorised(csc_matrix(matrix * np.nan))
 
 
