@@ -93,8 +93,8 @@ if TYPE_CHECKING:
     from .uv_lookup import UVHit as UVHit
     from .uv_lookup import UVIndex as UVIndex
     from .uv_lookup import transfer_uv as transfer_uv
-    from .uv_report import UVReport as UVReport
-    from .uv_report import uv_report as uv_report
+    from .uv_measure import UVReport as UVReport
+    from .uv_measure import uv_report as uv_report
     from .uv_texture import TexelMap as TexelMap
     from .uv_texture import fill_gutter as fill_gutter
     from .uv_texture import sample_texture as sample_texture
@@ -133,7 +133,7 @@ _ROOM = {
     "UVIndex": "uv_lookup",
     "UVLayout": "unwrap",
     "UVMap": "uv",
-    "UVReport": "uv_report",
+    "UVReport": "uv_measure",
     "Unskinned": "unskin",
     "UnskinnedRoots": "unskin_roots",
     "UnwrapOptions": "unwrap",
@@ -187,8 +187,8 @@ _ROOM = {
     "transfer_rows": "weight_transfer",
     "transfer_uv": "uv_lookup",
     "transform_points": "rigid",
-    "uv_report": "uv_report",
     "vertex_graph": "mesh_graph",
+    "uv_report": "uv_measure",
     "vertex_normals": "surface",
 }
 __all__ = list(_ROOM)  # pyright: ignore[reportUnsupportedDunderAll]

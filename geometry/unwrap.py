@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .errors import InputError
 from .uv import UVMap
-from .uv_report import UVReport, report_of_arrays
+from .uv_measure import UVReport, report_of_arrays
 
 Method = Literal["slim", "arap", "lscm", "harmonic"]
 Engine = Literal["monopart", "xatlas"]
@@ -73,7 +73,7 @@ def unwrap(
     verts: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
     *,
-    parts: Int[Tensor, "F"] | None = None,
+    parts: Int[Tensor, "P"] | None = None,
     progress: Callable[[str, float], None] | None = None,
     **options: Unpack[UnwrapOptions],
 ) -> UVLayout:
@@ -85,7 +85,7 @@ def unwrap(
     Args:
         verts: vertices, metres, finite.
         faces: vertex indices.
-        parts: label of each face; no chart crosses from one to another.
+        parts: label of each face, (F); no chart crosses from one to another.
         progress: called with the name of a stage and the share of it that is done.
         **options: `UnwrapOptions`: target 4.03, method "slim", engine "monopart", size 2048,
             margin 4, symmetric True, max_charts None, chart_share None.
@@ -143,6 +143,7 @@ def _checked(options: UnwrapOptions) -> Any:
             f"size, margin: expected 16 texels or more and a margin of at most a sixteenth, found "
             f"{chosen['size']} and {chosen['margin']}; enlarge the texture"
         )
+    chosen["margin"] = float(chosen["margin"])
     if chosen["chart_share"] is None:
         chosen["chart_share"] = min(1.0, 0.06 * ((chosen["target"] - 4) / 0.03) ** 0.75)
     elif not 0 < chosen["chart_share"] <= 1:

@@ -12,8 +12,9 @@ ISOMETRIC = 4.0
 def flat_triangles(verts: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> np.ndarray:
     """Every triangle laid into the plane with its own lengths.
 
-    Triangles without area get a little: each of their sides is lengthened until it is the
-    tenth of a thousandth of the longest one shorter than the other two together.
+    Triangles without area get a little: each of their sides is lengthened until the longest is
+    shorter than the other two together by a tenth of a thousandth of itself, or by as much as
+    whole multiples of 2⁻²⁴ can show in a layout of the whole mesh.
 
     Args:
         verts: vertices.
@@ -28,9 +29,10 @@ def flat_triangles(verts: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"
     """
     corners = verts[faces]
     sides = np.linalg.norm(np.roll(corners, -1, 1) - corners, axis=-1)  # 01, 12, 20
-    scale = np.maximum(sides.max(1, keepdims=True), 1e-12 * max(float(np.abs(verts).max()), 1e-30))
-    slack = sides.sum(1, keepdims=True) - 2 * sides.max(1, keepdims=True)
-    sides = sides + np.maximum(1e-4 * scale - slack, 0.0)
+    longest = sides.max(1, keepdims=True)
+    span = max(float(np.linalg.norm(longest)), 1e-30)
+    slack = sides.sum(1, keepdims=True) - 2 * longest
+    sides = sides + np.maximum(np.maximum(1e-4 * longest, 4e-6 * span) - slack, 0.0)
     a, b, c = sides.T
     x = (a * a + c * c - b * b) / (2 * a)
     half = sides.sum(1) / 2

@@ -110,14 +110,12 @@ def harmonic_map(
     ring = np.flatnonzero(cut.loop >= 0)
     right = -(matrix[:, ring] @ uv[ring])
     inner = matrix[:, inside].tocsc()
-    uv[inside] = _solve(inner, right, kind == "mean_value")
+    uv[inside] = _solve(inner, right)
     return uv
 
 
-def _solve(matrix: Any, right: np.ndarray, general: bool) -> np.ndarray:
-    from scipy.sparse.linalg import splu
-
-    factors = splu(matrix) if general else factorised(matrix)
+def _solve(matrix: Any, right: np.ndarray) -> np.ndarray:
+    factors = factorised(matrix)
     out = factors.solve(right)
     # one correction: what is left of the residual decides whether tiny triangles flip
     return out + factors.solve(right - matrix @ out)
@@ -172,7 +170,7 @@ def slim_start(
             np.zeros((0, 2), order="F"),
             0.0,
         )
-        found = igl.slim_solve(data, _SLIM_START)[:, :2]
+        found = np.asarray(igl.slim_solve(data, _SLIM_START))[:, :2]
         jacobian = RestShape.of(places, faces).jacobians(found[faces])
         if np.isfinite(found).all() and (np.linalg.det(jacobian) > 0).all():
             out[used] = found
@@ -200,12 +198,12 @@ def lscm_map(cut: CutMesh, verts: Float[np.ndarray, "V 3"]) -> Float[np.ndarray,
         held = np.array([first, far], np.int64)
         gap = max(float(np.linalg.norm(places[far] - places[first])), 1e-30)
         found, _ = igl.lscm(places, faces.astype(np.int64), held, np.array([[0.0, 0], [gap, 0]]))
-        uv[used] = _to_area(found, places, faces)
+        uv[used] = _to_area(np.asarray(found), places, faces)
     return uv
 
 
 def arap_map(cut: CutMesh, verts: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "W 2"]:
-    """As-rigid-as-possible maps by libigl, from the harmonic one; may flip faces.
+    """As-rigid-as-possible maps, from the harmonic one; may flip faces.
 
     Args:
         cut: the cut mesh; every chart is a disc.
@@ -217,17 +215,29 @@ def arap_map(cut: CutMesh, verts: Float[np.ndarray, "V 3"]) -> Float[np.ndarray,
     Reference:
         Liu et al. 2008, A local/global approach to mesh parameterization.
     """
-    import igl
+    from scipy.sparse import diags
 
+    flat = flat_triangles(verts, cut.edges.faces)
+    rest = np.concatenate([np.zeros((len(flat), 1, 2)), flat.transpose(0, 2, 1)], 1)
+    side = np.roll(rest, -1, 1) - rest
+    weight = corner_weights(flat, "cotangent")[..., 0]
+    matrix = laplacian(cut, flat, "cotangent")
+    hold = 1e-8 * np.abs(matrix.diagonal()).mean()
+    factors = factorised((matrix + diags(np.full(len(cut.origin), hold))).tocsc())
     uv = harmonic_map(cut, verts)
-    for chart in range(cut.num_charts):
-        used, places, faces = disc_of(cut, chart, verts)
-        data = igl.ARAPData()
-        data.energy = igl.ARAPEnergyType.ARAP_ENERGY_TYPE_SPOKES_AND_RIMS
-        data.max_iter = _ARAP_STEPS
-        held = np.zeros(1, np.int64)
-        igl.arap_precomputation(places, faces.astype(np.int64), 2, held, data)
-        uv[used] = igl.arap_solve(uv[used][:1], data, np.asfortranarray(uv[used]))
+    for _ in range(_ARAP_STEPS):
+        now = np.roll(uv[cut.faces], -1, 1) - uv[cut.faces]
+        cross = np.einsum("fk,fki,fkj->fij", weight, now, side)
+        # the nearest rotation in the plane, by the angle of the conformal part
+        angle = np.arctan2(cross[:, 1, 0] - cross[:, 0, 1], cross[:, 0, 0] + cross[:, 1, 1])
+        cos, sin = np.cos(angle), np.sin(angle)
+        turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+        pull = weight[..., None] * np.einsum("fij,fkj->fki", turn, side)
+        right = hold * uv
+        for axis in range(2):
+            values = np.roll(pull[..., axis], 1, 1) - pull[..., axis]
+            right[:, axis] += np.bincount(cut.faces.reshape(-1), values.reshape(-1), len(uv))
+        uv = factors.solve(right)
     return uv
 
 

@@ -10,12 +10,14 @@ from .errors import InputError
 from .surface import SurfaceIndex
 from .uv import UVMap
 
-_CHUNK = 2_000_000
+_CHUNK = 125_000
+_INWARDS = 1e-3
+"""Share of the way from a corner to the middle of its face."""
 
 
 @dataclass(frozen=True, eq=False)
 class UVHit:
-    """Where points of the texture lie on the surface; has `.face` and `.bary` as `UVMap.at` asks."""
+    """Where points of the texture lie on the surface; what `UVMap.at` asks for."""
 
     face: Int[Tensor, "n"]
     """Face index; −1 between the charts."""
@@ -39,9 +41,18 @@ class UVIndex:
         Args:
             uv: the map, without overlaps (of faces that overlap the lowest index is found).
             cells: cells along a side; None: about one a face.
+
+        Raises:
+            InputError: coordinates that are not finite, a grid without cells.
         """
         self.corner_uv = uv.corner_uv
         corner = uv.corner_uv.detach().double()
+        if not corner.isfinite().all():
+            raise InputError(
+                "uv: expected finite coordinates, found NaN or infinity; unwrap the mesh anew"
+            )
+        if cells is not None and cells < 1:
+            raise InputError(f"cells: expected at least one, found {cells}")
         count = len(corner)
         self.cells = cells or max(1, min(2048, int(count**0.5)))
         low = (corner.amin(1) * self.cells - 1e-6).floor().long().clamp(0, self.cells - 1)
@@ -63,7 +74,7 @@ class UVIndex:
         """Faces and barycentric coordinates of points of the texture.
 
         Args:
-            points: (u, v).
+            points: (u, v); outside of the unit square, and NaN, nothing is found.
             slack: how far outside of a face, in barycentric coordinates, still counts as in it.
 
         Returns:
@@ -73,11 +84,15 @@ class UVIndex:
         >>> UVIndex(UVMap(face)).locate(torch.tensor([[0.25, 0.5], [0.9, 0.9]])).face.tolist()
         [0, -1]
         """
+        if len(self.corner_uv) == 0:
+            none = torch.full((len(points),), -1, dtype=torch.int64, device=points.device)
+            return UVHit(none, points.new_zeros(len(points), 3), none >= 0)
         with torch.no_grad():
-            face = torch.cat([self._search(p, slack) for p in points.detach().split(_CHUNK // 16)])
+            face = torch.cat([self._search(p, slack) for p in points.detach().split(_CHUNK)])
         corner = self.corner_uv[face.clamp(min=0)].to(points.dtype)
         found = face >= 0
-        bary = torch.where(found[:, None], _bary(points, corner), 0.0)
+        safe = torch.where(found[:, None], points, corner[:, 0].detach())
+        bary = torch.where(found[:, None], _bary(safe, corner), 0.0)
         return UVHit(face, bary, found)
 
     def _search(self, points: Tensor, slack: float) -> Tensor:
@@ -120,8 +135,9 @@ def transfer_uv(
 ) -> UVMap:
     """The map of one mesh brought to another mesh of the same surface.
 
-    Each new face asks at points just inside its corners and takes the chart of the surface next to
-    its middle: all its corners come from one chart, so no face is stretched over a seam.
+    Each new face asks at points just inside its corners, in the chart of the surface next to its
+    middle. Where the corners still come from both sides of a seam (of a chart that meets itself)
+    the plane of the face next to the middle goes on to them: no face is stretched over a seam.
 
     Args:
         verts: vertices of the mesh that has the map, metres.
@@ -135,11 +151,19 @@ def transfer_uv(
         seam reach beyond the border of their chart, into its margin.
 
     Raises:
-        InputError: maps and faces of different number.
-    """
-    from .uv_mesh import MeshEdges, components
-    from .uv_report import seams_of_layout
+        InputError: a mesh without faces, maps and faces of different number.
 
+    >>> verts, faces = torch.eye(3), torch.tensor([[0, 1, 2]])
+    >>> uv = UVMap(torch.tensor([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]]))
+    >>> turned = transfer_uv(verts, faces, uv, verts, faces.roll(1, 1)).corner_uv
+    >>> (turned - uv.corner_uv.roll(1, 1)).abs().max().item() < 1e-6
+    True
+    """
+    from .uv_measure import seams_of_layout
+    from .uv_mesh import MeshEdges, components
+
+    if len(faces) == 0:
+        raise InputError("faces: expected a mesh with faces to take the map from, found none")
     if len(uv.corner_uv) != len(faces):
         raise InputError(
             f"uv: expected coordinates of {len(faces)} faces, found {len(uv.corner_uv)}"
@@ -150,15 +174,19 @@ def transfer_uv(
     chart = torch.from_numpy(components(len(faces), pairs[:, 0], pairs[:, 1])).to(faces.device)
     corners = new_verts[new_faces]
     middle = corners.mean(1)
-    own = chart[SurfaceIndex(verts, faces).query(middle).face]
-    out = torch.zeros(len(new_faces), 3, 2, dtype=uv.corner_uv.dtype, device=faces.device)
+    near = SurfaceIndex(verts, faces).query(middle)
+    own, side = chart[near.face], near.face[:, None].expand(-1, 3)
+    out = uv.at_faces(side, _beyond(verts, faces, side, corners).to(uv.corner_uv))
     for number in own.unique().tolist():
         some = torch.nonzero(chart == number)[:, 0]
         mine = torch.nonzero(own == number)[:, 0]
-        hit = SurfaceIndex(verts, faces[some]).query(corners[mine].reshape(-1, 3))
-        found = _beyond(verts, faces[some], hit.face, corners[mine].reshape(-1, 3))
-        near = UVMap(uv.corner_uv[some]).at_faces(hit.face, found.to(uv.corner_uv))
-        out[mine] = near.reshape(-1, 3, 2)
+        inner = corners[mine] + _INWARDS * (middle[mine, None] - corners[mine])
+        hit = SurfaceIndex(verts, faces[some]).query(inner.reshape(-1, 3))
+        face = some[hit.face].reshape(-1, 3)
+        found = uv.at_faces(face, _beyond(verts, faces, face, corners[mine]).to(uv.corner_uv))
+        size = (out[mine].roll(1, 1) - out[mine]).norm(dim=-1).amax(1)
+        torn = (found - out[mine]).norm(dim=-1).amax(1) > size
+        out = out.index_copy(0, mine, torch.where(torn[:, None, None], out[mine], found))
     return UVMap(out)
 
 
@@ -168,6 +196,9 @@ def _beyond(verts: Tensor, faces: Tensor, face: Tensor, points: Tensor) -> Tenso
     side1, side2, to = b - a, c - a, points.double() - a
     d11, d12, d22 = (side1**2).sum(-1), (side1 * side2).sum(-1), (side2**2).sum(-1)
     e1, e2 = (to * side1).sum(-1), (to * side2).sum(-1)
-    det = (d11 * d22 - d12 * d12).clamp(min=1e-300)
+    det = d11 * d22 - d12 * d12
+    # a face without area has no plane: its first corner stands for it
+    flat = det <= 1e-12 * d11 * d22
+    det = torch.where(flat, torch.inf, det)
     v, w = (d22 * e1 - d12 * e2) / det, (d11 * e2 - d12 * e1) / det
     return torch.stack([1 - v - w, v, w], -1)

@@ -24,7 +24,7 @@ def mirrored_edges(surface: Surface, some: Int[np.ndarray, "n"]) -> Int[np.ndarr
     base = len(surface.verts)
     known = surface.edges.verts[:, 0] * base + surface.edges.verts[:, 1]
     there = np.isin(image[:, 0] * base + image[:, 1], known)
-    pairs = [image[there], *(_way_around(surface, a, b) for a, b in image[~there])]
+    pairs = [image[there], *(_way_around(surface, a, b) for a, b in image[~there].tolist())]
     return edge_index(surface.edges, np.concatenate(pairs))
 
 
@@ -65,12 +65,12 @@ def symmetric_edges(surface: Surface, some: Int[np.ndarray, "n"]) -> Int[np.ndar
 
 def _own_image(surface: Surface, some: np.ndarray) -> bool:
     """Whether the image of most vertices of some edges lies within an edge or two of them."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     used = np.unique(surface.edges.verts[some])
     places = surface.verts[used]
     image = surface.verts[np.zeros(0, np.int64) if surface.mirror is None else surface.mirror[used]]
-    distance = cKDTree(places).query(image)[0]
+    distance = KDTree(places).query(image)[0]
     return bool((distance <= 1.5 * surface.length[some].mean()).mean() > 0.8)
 
 
@@ -84,14 +84,14 @@ def chart_mates(surface: Surface, cut: CutMesh) -> Int[np.ndarray, "C"]:
     Returns:
         Chart numbers.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     count = cut.num_charts
     mates = np.full(count, -1, np.int64)
     if surface.mirror is None:
         return mates
     centre = surface.verts[surface.faces].mean(1)
-    image = cKDTree(centre).query(surface.verts[surface.mirror[surface.faces]].mean(1))[1]
+    image = KDTree(centre).query(surface.verts[surface.mirror[surface.faces]].mean(1))[1]
     key, votes = np.unique(cut.chart * count + cut.chart[image], return_counts=True)
     order = np.lexsort((-votes, key // count))
     _, first = np.unique(key[order] // count, return_index=True)

@@ -6,11 +6,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from .errors import InputError
 from .uv_energy import RestShape, face_energy, newton_terms
 
 _LARGEST_STEP = 0.9
 """Share of the way to the first triangle without area."""
 _TRIES = 12
+_HELD = (1e-12, 1e-9, 1e-6, 1e-3, 1.0)
+"""Shares of the diagonal that are added, one after the other, where a matrix is singular."""
+_SYMMETRIC = {
+    "permc_spec": "MMD_AT_PLUS_A",
+    "diag_pivot_thresh": 0.0,
+    "options": {"SymmetricMode": True, "Equil": False},
+}
 
 
 @dataclass(eq=False)
@@ -94,6 +102,7 @@ class NewtonSolver:
         length = np.full(self.num_charts, np.inf)
         np.minimum.at(length, self.chart, limit)
         length = np.minimum(1.0, _LARGEST_STEP * length)
+        worse = np.zeros(self.num_charts, bool)
         for _ in range(_TRIES):
             trial = uv + length[self.vert_chart, None] * step
             after = self.energies(trial)
@@ -109,20 +118,36 @@ class NewtonSolver:
 def factorised(matrix: Any) -> Any:
     """LU factors of a symmetric positive definite sparse matrix.
 
+    A matrix that rounding made singular (needles, faces without area) is tried again with pivots,
+    and then with more and more added to its diagonal.
+
     Args:
         matrix: a `scipy.sparse.csc_matrix`.
 
     Returns:
         An object with ``solve``.
+
+    Raises:
+        InputError: a matrix that is not finite.
     """
+    from scipy.sparse import diags
     from scipy.sparse.linalg import splu
 
-    return splu(
-        matrix,
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True, "Equil": False},
-    )
+    if not np.isfinite(matrix.data).all():
+        raise InputError(
+            "verts, faces: expected triangles whose shape float64 can hold, found some of no or "
+            "endless size; clean the mesh"
+        )
+    size = np.abs(matrix.diagonal())
+    size = size + max(float(size.mean()), 1e-300)
+    for share in (0.0, *_HELD):
+        held = (matrix + diags(share * size)).tocsc() if share else matrix
+        for options in (_SYMMETRIC, {}):
+            try:
+                return splu(held, **options)
+            except RuntimeError:  # a pivot of zero
+                continue
+    raise InputError("verts, faces: expected a mesh that can be flattened, found one that cannot")
 
 
 def _spread(rest: RestShape) -> np.ndarray:

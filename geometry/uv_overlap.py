@@ -80,8 +80,8 @@ def overlapping_pairs(corner_uv: Float[np.ndarray, "F 3 2"]) -> Int[np.ndarray, 
     solid = np.flatnonzero(sign != 0)
     boxes = np.concatenate([corner_uv.min(1), corner_uv.max(1)], 1)[solid]
     found = []
-    for a, b in _close_boxes(boxes):
-        a, b = solid[a], solid[b]
+    for first, second in _close_boxes(boxes):
+        a, b = solid[first], solid[second]
         hit = ~(_separated(corner_uv[a], corner_uv[b]) | _separated(corner_uv[b], corner_uv[a]))
         found.append(np.stack([a[hit], b[hit]], 1))
     pairs = np.concatenate(found) if found else np.zeros((0, 2), np.int64)

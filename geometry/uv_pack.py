@@ -1,6 +1,7 @@
 """Packing of charts into the unit square: turned, rasterised, put where they touch the most."""
 
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -10,6 +11,8 @@ from .errors import InputError
 _TURNS = 12
 _COARSE, _FINE = 128, 384
 _TRIALS = 24
+_FREE, _MANY = 60, 150
+"""Up to the first number of charts all orders are tried; above the second boxes go on shelves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +48,8 @@ def packed(
 ) -> Packing:
     """Pack charts into the unit square at one common scale.
 
-    Many orders are tried on a coarse grid; the best one is repeated on a fine grid.
+    Many orders are tried on a coarse grid; the best one is repeated on a fine grid. More than 150
+    charts go on shelves, box by box: looser, but in a time that grows with their number alone.
 
     Args:
         corner: coordinates per face corner, each chart in a plane of its own.
@@ -61,6 +65,8 @@ def packed(
     area = np.abs(side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0]) / 2
     sizes = np.bincount(chart, area, minlength=count)
     faces = [corner[rows] for rows in _rows_of(chart, count)]
+    if count > _MANY:
+        return _shelved(faces, margin / size)
     coarse = _Board.of(faces, sizes, _COARSE, margin * _COARSE / size, _TURNS)
     width, recipe = _searched(coarse, sizes)
     fine = int(np.clip(size // 2, 2 * _COARSE, _FINE))
@@ -73,14 +79,63 @@ def _rows_of(chart: np.ndarray, count: int) -> list[np.ndarray]:
     return np.split(order, np.searchsorted(chart[order], np.arange(1, count)))
 
 
+def _shelved(faces: list[np.ndarray], gap: float) -> Packing:
+    """Charts in their smallest boxes, the tallest first, in rows from the bottom."""
+    turns, lows, boxes = [], [], []
+    for corner in faces:
+        angle = _level_angle(corner.reshape(-1, 2))
+        turned = corner.reshape(-1, 2) @ _rotation(angle).T
+        if np.ptp(turned[:, 1]) > np.ptp(turned[:, 0]):
+            angle += np.pi / 2
+            turned = corner.reshape(-1, 2) @ _rotation(angle).T
+        turns.append(_rotation(angle))
+        lows.append(turned.min(0))
+        boxes.append(np.ptp(turned, axis=0))
+    box = np.array(boxes)
+    order = np.argsort(-box[:, 1], kind="stable")
+    # so many boxes can have a margin each that nothing is left: then the margin gives way
+    gap = min(max(gap, 1e-6), 0.25 / np.ceil(np.sqrt(len(faces))))
+    low, high = 0.0, 1 / max(float(np.sqrt(box.prod(1).sum())), float(box.max()), 1e-300)
+    places = None
+    for _ in range(40):
+        middle = (low + high) / 2
+        trial = _on_shelves(box[order] * middle + gap)
+        if trial is None:
+            high = middle
+        else:
+            low, places = middle, trial
+    if places is None:
+        raise InputError("charts: expected charts that fit a square, found none that do")
+    shift = np.zeros((len(faces), 2))
+    shift[order] = places + gap / 2
+    return Packing(low, np.stack(turns), shift - low * np.array(lows))
+
+
+def _on_shelves(box: np.ndarray) -> np.ndarray | None:
+    """Lower left corners of boxes of falling height in the unit square; None if they do not fit."""
+    out, at, bottom, top = [], 0.0, 0.0, 0.0
+    for wide, tall in box.tolist():
+        if at + wide > 1:
+            at, bottom = 0.0, top
+        if at + wide > 1 or bottom + tall > 1:
+            return None
+        top = max(top, bottom + tall)
+        out.append((at, bottom))
+        at += wide
+    return np.array(out)
+
+
+def _rotation(angle: float) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
 def _stamps(corner: np.ndarray, gap: float, turns: np.ndarray, count: int) -> list[Stamp]:
     """A chart in some of so many turns; turn 0 has its long side level or upright."""
     base = _level_angle(corner.reshape(-1, 2))
     out = []
     for k in turns:
-        angle = base + 2 * np.pi * k / count
-        cos, sin = np.cos(angle), np.sin(angle)
-        turn = np.array([[cos, -sin], [sin, cos]])
+        turn = _rotation(base + 2 * np.pi * k / count)
         mask, low = coverage(corner @ turn.T, gap)
         mask = np.pad(mask, 1)
         near = mask.copy()
@@ -195,14 +250,15 @@ class _Board:
 
     def placed(self, recipe: _Recipe, width: int) -> list[tuple[int, int, int]] | None:
         """Turn, row and column of each chart in a square of some cells; None if they do not fit."""
-        from scipy.fft import fft2, ifft2
+        from scipy import fft
 
         taken = np.ones((self.canvas, self.canvas), bool)
         taken[1 : width - 1, 1 : width - 1] = False
         places: list[tuple[int, int, int]] = [(0, 0, 0)] * len(self.stamps)
         for chart in recipe.order:
             stamps = self.stamps[chart]
-            hits = ifft2(fft2(taken.astype(np.complex64)) * self.spectra[chart])
+            spectrum = np.asarray(fft.fft2(taken.astype(np.complex64)))
+            hits = np.asarray(fft.ifft2(spectrum * self.spectra[chart]))
             best, found = -8.0, None
             for which, stamp in enumerate(stamps):
                 if recipe.goals is None:
@@ -237,7 +293,7 @@ def _spectra(stamps: list[Stamp], canvas: int) -> np.ndarray:
     for own, stamp in zip(both, stamps, strict=True):
         height, width = stamp.mask.shape
         own[:height, :width] = stamp.mask + 1j * stamp.rim
-    return np.conj(fft2(both))
+    return np.conj(np.asarray(fft2(both)))
 
 
 def _worth(hits: np.ndarray, stamp: Stamp, width: int, bias: float) -> np.ndarray:
@@ -247,12 +303,12 @@ def _worth(hits: np.ndarray, stamp: Stamp, width: int, bias: float) -> np.ndarra
         return np.zeros((0, 0))
     hits = hits[: width - height + 1, : width - wide + 1]
     # conj(F(mask + i rim)) · F(taken) gives hits − i contacts
-    contact = -hits.imag / stamp.rim.sum()
+    contact = -np.imag(hits) / stamp.rim.sum()
     if bias:
         row, column = np.arange(hits.shape[0])[:, None], np.arange(hits.shape[1])[None]
         far = np.maximum(row + height, column + wide) / width
         contact = contact - np.float32(bias) * far.astype(np.float32)
-    return np.where(hits.real < 0.5, contact, np.float32(-9.0))
+    return np.where(np.real(hits) < 0.5, contact, np.float32(-9.0))
 
 
 def _nearness(hits: np.ndarray, stamp: Stamp, width: int, goal: np.ndarray) -> np.ndarray:
@@ -263,14 +319,14 @@ def _nearness(hits: np.ndarray, stamp: Stamp, width: int, goal: np.ndarray) -> n
     hits = hits[: width - height + 1, : width - wide + 1]
     column, row = goal * width + stamp.low
     away = np.hypot(np.arange(len(hits))[:, None] - row, np.arange(hits.shape[1])[None] - column)
-    contact = -hits.imag / stamp.rim.sum()
-    return np.where(hits.real < 0.5, 0.3 * contact - 4 * away / width, -9.0)
+    contact = -np.imag(hits) / stamp.rim.sum()
+    return np.where(np.real(hits) < 0.5, 0.3 * contact - 4 * away / width, -9.0)
 
 
 def _round_up(number: int) -> int:
     from scipy.fft import next_fast_len
 
-    return int(next_fast_len(number))
+    return int(cast(Any, next_fast_len)(number))
 
 
 def _searched(board: _Board, sizes: np.ndarray) -> tuple[int, _Recipe]:
@@ -278,7 +334,7 @@ def _searched(board: _Board, sizes: np.ndarray) -> tuple[int, _Recipe]:
     random = np.random.default_rng(0)
     extent = np.array([max(own[0].mask.shape) for own in board.stamps], float)
     best: tuple[int, _Recipe] | None = None
-    for trial in range(_TRIALS):
+    for trial in range(max(6, min(_TRIALS, _TRIALS * _FREE // len(sizes)))):
         measure = sizes if trial % 2 else extent**2
         noise = np.exp((0.0 if trial < 6 else 0.35) * random.standard_normal(len(sizes)))
         order = np.argsort(-measure * noise, kind="stable")

@@ -153,10 +153,11 @@ def _moves_of(atlas: Atlas, units: list[tuple[int, ...]], edges: np.ndarray) -> 
     chart = cut.chart[np.maximum(cut.edges.face_pairs[edges, 0], 0)]
     groups = []
     for unit in units:
-        own = edges[chart == unit[0]]
+        lead = unit[0]
+        own = edges[chart == lead]
         if len(unit) > 1:
             own = np.union1d(own, mirrored_edges(surface, own))
-        elif surface.mirror is not None and _is_own_mate(atlas, unit[0]):
+        elif surface.mirror is not None and _is_own_mate(atlas, lead):
             own = symmetric_edges(surface, own)
         groups.append(own[~cut.seams[own]])
     trial = atlas.opened(np.concatenate(groups))

@@ -81,10 +81,10 @@ def mirror_of(
         faces: vertex indices.
 
     Returns:
-        Vertex indices and the signed distance of each vertex from the plane, or None where no plane brings 95 % of the vertices onto others (to a tenth
-        of the mean edge).
+        Vertex indices and the signed distance of each vertex from the plane, or None where no
+        plane brings 95 % of the vertices onto others (to a tenth of the mean edge).
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if len(faces) == 0:
         return None
@@ -92,7 +92,7 @@ def mirror_of(
     points = verts[used]
     edge = np.linalg.norm(verts[faces[:, 0]] - verts[faces[:, 1]], axis=-1).mean()
     middle = (points.min(0) + points.max(0)) / 2
-    tree = cKDTree(points)
+    tree = KDTree(points)
     for axis in range(3):
         flipped = points.copy()
         flipped[:, axis] = 2 * middle[axis] - flipped[:, axis]
@@ -210,11 +210,11 @@ def _sphere_slits(surface: Surface, cut: CutMesh) -> np.ndarray:
     graph = surface.graph(cut)
     spheres = np.flatnonzero(cut.euler == 2)
     start = _first_of(cut.vert_chart, cut.num_charts)[spheres]
-    for _ in range(2):
-        distance, before = _shortest(graph, start)
-        ends, start = start, _farthest(distance, cut.vert_chart, cut.num_charts)[spheres]
-    del ends
-    return path_edges(surface, cut, before, start)
+    distance, _ = _shortest(graph, start)
+    begin = _farthest(distance, cut.vert_chart, cut.num_charts)[spheres]
+    distance, before = _shortest(graph, begin)
+    end = _farthest(distance, cut.vert_chart, cut.num_charts)[spheres]
+    return path_edges(surface, cut, before, end)
 
 
 def _farthest(distance: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
@@ -293,9 +293,9 @@ def _handles(surface: Surface, cut: CutMesh, bad: Bool[np.ndarray, "C"]) -> np.n
     # a tree over the faces that takes the longest loops first, so the shortest remain to be cut
     pairs = np.sort(edges.face_pairs[inner[free]], 1)
     order = np.lexsort((-loop[free], pairs[:, 1], pairs[:, 0]))
-    first = np.ones(len(order), bool)
-    first[1:] = (np.diff(pairs[order], axis=0) != 0).any(1)
-    chosen = order[first]
+    lead = np.ones(len(order), bool)
+    lead[1:] = (np.diff(pairs[order], axis=0) != 0).any(1)
+    chosen = order[lead]
     count = len(edges.faces)
     weight = 2 * loop[free].max(initial=1.0) - loop[free][chosen]
     rows = (pairs[chosen, 0], pairs[chosen, 1])

@@ -58,7 +58,7 @@ def texel_map(uv: UVMap, size: int) -> TexelMap:
 
 
 def fill_gutter(
-    texture: Float[Tensor, "h w c"], covered: Bool[Tensor, "h w"], texels: int
+    texture: Float[Tensor, "h w c"], covered: Bool[Tensor, "p q"], texels: int
 ) -> Float[Tensor, "h w c"]:
     """Spread the colours at the borders of the charts outwards, so that filters find no blank.
 
@@ -66,18 +66,27 @@ def fill_gutter(
 
     Args:
         texture: colours.
-        covered: texels that have one.
+        covered: texels that have one, (h, w).
         texels: number of rounds, that is, width of the gutter.
 
     Returns:
-        The texture; covered texels are unchanged; differentiable.
+        The texture; covered texels are unchanged, those out of reach zero; differentiable.
+
+    Raises:
+        InputError: a mask of another size than the texture, a negative width.
 
     >>> fill_gutter(torch.tensor([[[1.0], [0.0]]]), torch.tensor([[True, False]]), 1).flatten()
     tensor([1., 1.])
     """
-    image = texture.movedim(-1, 0)[None]
+    if covered.shape != texture.shape[:2] or texels < 0:
+        raise InputError(
+            f"covered, texels: expected a mask of {tuple(texture.shape[:2])} texels and a width of "
+            f"0 or more, found {tuple(covered.shape)} and {texels}"
+        )
+    if texture.numel() == 0:
+        return texture
     mask = covered[None, None].to(texture)
-    image = image * mask
+    image = torch.where(covered, texture.movedim(-1, 0), 0.0)[None]
     for _ in range(texels):
         total = 9 * torch.nn.functional.avg_pool2d(image, 3, 1, 1)
         number = 9 * torch.nn.functional.avg_pool2d(mask, 3, 1, 1)
@@ -91,7 +100,7 @@ def sample_texture(
     texture: Float[Tensor, "h w c"],
     uv: Float[Tensor, "n 2"],
     chart: Int[Tensor, "n"],
-    texel_chart: Int[Tensor, "h w"],
+    texel_chart: Int[Tensor, "p q"],
 ) -> Float[Tensor, "n c"]:
     """Bilinear look-up that reads texels of the point's own chart alone.
 
@@ -101,12 +110,15 @@ def sample_texture(
     Args:
         texture: colours; row 0 is at v = 0.
         uv: points.
-        chart: chart of each point.
-        texel_chart: chart of each texel, −1 between the charts.
+        chart: chart of each point; −1 (nothing found) has no colour.
+        texel_chart: chart of each texel, (h, w); −1 between the charts.
 
     Returns:
         Colours; zero where none of the four texels is of the chart. Differentiable in the texture
         and in uv.
+
+    Raises:
+        InputError: a texture without texels, charts of another size than the texture.
 
     >>> texture = torch.tensor([[[1.0], [3.0]]])
     >>> at, both = torch.tensor([[0.5, 0.5]]), torch.tensor([[0, 1]])
@@ -114,16 +126,23 @@ def sample_texture(
     tensor([[3.]])
     """
     height, width = texture.shape[:2]
+    if height * width == 0 or texel_chart.shape != (height, width):
+        raise InputError(
+            f"texture, texel_chart: expected two of one size with a texel at least, found "
+            f"{tuple(texture.shape)} and {tuple(texel_chart.shape)}"
+        )
     x, y = uv[:, 0] * width - 0.5, uv[:, 1] * height - 0.5
     left, low = x.detach().floor(), y.detach().floor()
-    total, weights = 0.0, 0.0
-    for dx in (0, 1):
-        for dy in (0, 1):
+    right, up = x - left, y - low
+    total = texture.new_zeros(len(uv), texture.shape[2])
+    weights = texture.new_zeros(len(uv), 1)
+    for dx, across in ((0, 1 - right), (1, right)):
+        for dy, along in ((0, 1 - up), (1, up)):
             column = (left + dx).long().clamp(0, width - 1)
             row = (low + dy).long().clamp(0, height - 1)
-            weight = (1 - (x - left - dx).abs()) * (1 - (y - low - dy).abs())
-            weight = torch.where(texel_chart[row, column] == chart, weight, 0.0)[:, None]
+            own = (texel_chart[row, column] == chart) & (chart >= 0)
+            weight = torch.where(own, across * along, 0.0)[:, None]
             total = total + weight * texture[row, column]
             weights = weights + weight
-    some = torch.as_tensor(weights) > 0
+    some = weights > 0
     return torch.where(some, total / torch.where(some, weights, 1.0), 0.0)

@@ -37,6 +37,8 @@ def xatlas_layout(
     pack = xatlas.PackOptions()
     pack.padding = int(np.ceil(margin))
     pack.resolution = size
+    # what xatlas calls a rotation swaps u and v, which turns the chart over
+    pack.rotate_charts = False
     atlas.generate(charts, pack, False)
     corner = np.zeros((len(faces), 3, 2))
     ids = np.zeros((len(faces), 3), np.int64)

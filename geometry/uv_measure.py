@@ -41,7 +41,7 @@ class UVReport:
     size: int
     """Texels along a side of the texture, of which the density speaks."""
 
-    def to_dict(self) -> dict[str, float]:
+    def to_dict(self) -> dict[str, int | float]:
         """The figures by name, for JSON."""
         return asdict(self)
 
