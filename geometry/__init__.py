@@ -170,9 +170,9 @@ _ROOM = {
     "ray_box": "boxes",
     "read_body_arrays": "body_io",
     "read_npy_object": "body_io",
-    "ring_of_cameras": "camera_paths",
     "regions_by_name": "part_tables",
     "remove_islands": "part_cleaning",
+    "ring_of_cameras": "camera_paths",
     "rotation_angle": "rotations",
     "rotmat_to_axis_angle": "rotations",
     "rotmat_to_quat_wxyz": "rotations",
@@ -187,8 +187,8 @@ _ROOM = {
     "transfer_rows": "weight_transfer",
     "transfer_uv": "uv_lookup",
     "transform_points": "rigid",
-    "vertex_graph": "mesh_graph",
     "uv_report": "uv_measure",
+    "vertex_graph": "mesh_graph",
     "vertex_normals": "surface",
 }
 __all__ = list(_ROOM)  # pyright: ignore[reportUnsupportedDunderAll]

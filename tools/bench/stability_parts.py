@@ -127,8 +127,8 @@ class _Shelled:
         """Whether points lie in marked voxels, in float64."""
         lo, dims = self.shell.lo[0].double().numpy(), self.shell.dims[0].numpy()
         cell = np.floor((points - lo) / self.shell.voxel)
-        there: np.ndarray = np.isfinite(cell).all(-1)
-        there = there & (cell >= 0).all(-1) & (cell < dims).all(-1)
+        sound = np.isfinite(cell) & (cell >= 0) & (cell < dims)
+        there = np.asarray(sound.all(-1))
         x, y, z = np.where(there[..., None], cell, 0).astype(np.int64).T
         return there & self.marked[z.T, y.T, x.T]
 
