@@ -111,7 +111,9 @@ def first_atlas(surface: Surface, seams: Bool[np.ndarray, "E"]) -> Atlas:
         seams = cut_to_discs(surface, seams)
         cut = CutMesh.of(surface.edges, seams)
         uv = harmonic_map(cut, surface.verts, "uniform")
-        bad = flipped_charts(cut, uv)
+        # a face may be so thin that rounding flips its Jacobian alone
+        endless = ~np.isfinite(face_energy(rest.jacobians(uv[cut.faces])))
+        bad = np.union1d(flipped_charts(cut, uv), np.unique(cut.chart[endless]))
         if len(bad) == 0:
             uv = slim_start(cut, surface.verts, uv, np.arange(cut.num_charts))
             return Atlas(surface, rest, cut, uv)

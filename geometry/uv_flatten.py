@@ -5,7 +5,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from .uv_energy import RestShape, flat_triangles
+from .uv_energy import RestShape, face_energy, flat_triangles
 from .uv_mesh import CutMesh
 from .uv_newton import factorised
 
@@ -158,7 +158,7 @@ def slim_start(
     """
     import igl
 
-    out = uv.copy()
+    out, rest = uv.copy(), RestShape.of(verts, cut.edges.faces)
     for chart in charts:
         used, places, faces = disc_of(cut, int(chart), verts)
         data = igl.slim_precompute(
@@ -171,8 +171,8 @@ def slim_start(
             0.0,
         )
         found = np.asarray(igl.slim_solve(data, _SLIM_START))[:, :2]
-        jacobian = RestShape.of(places, faces).jacobians(found[faces])
-        if np.isfinite(found).all() and (np.linalg.det(jacobian) > 0).all():
+        jacobian = rest.of_faces(cut.chart == chart).jacobians(found[faces])
+        if np.isfinite(face_energy(jacobian)).all():
             out[used] = found
     return out
 

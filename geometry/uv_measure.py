@@ -66,6 +66,7 @@ def uv_report(
     Raises:
         InputError: shapes that do not agree, or coordinates that are not finite.
 
+    >>> import torch
     >>> verts = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     >>> faces = torch.tensor([[0, 1, 2]])
     >>> report = uv_report(verts, faces, verts[faces][..., :2] / 2)

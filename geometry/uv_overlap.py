@@ -24,8 +24,10 @@ def orientation(
         Signs, int8. What rounding could decide is decided in rational numbers.
 
     >>> p = np.array([[0.1, 0.1]])
-    >>> int(orientation(p, 3 * p, np.array([[0.5, 0.5 + 1e-16]]))[0])
+    >>> int(orientation(p, 3 * p, np.array([[0.5, 0.5]]))[0])
     0
+    >>> int(orientation(p, 3 * p, np.array([[0.5, 0.5 + 1e-16]]))[0])
+    1
     """
     a, b, c = (np.asarray(x, np.float64) for x in (a, b, c))
     left = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1])

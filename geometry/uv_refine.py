@@ -165,8 +165,12 @@ def _moves_of(atlas: Atlas, units: list[tuple[int, ...]], edges: np.ndarray) -> 
     trial = trial.relaxed(_TRIAL_STEPS, active)
     corner, before, after = trial.corner_uv, atlas.face_excess, trial.face_excess
     scale = float(np.sqrt(atlas.rest.area.sum()))
+    # what was cut besides, to come to discs, belongs to the move: its coordinates need it
+    fresh = np.flatnonzero(trial.cut.seams & ~cut.seams)
+    owner = cut.chart[cut.edges.face_pairs[fresh, 0]]
     moves = []
-    for unit, own in zip(units, groups, strict=True):
+    for unit in units:
+        own = fresh[np.isin(owner, unit)]
         faces = np.flatnonzero(np.isin(cut.chart, unit))
         new = len(np.unique(trial.cut.chart[faces])) - len(unit)
         price = _SEAM_PRICE + float(surface.length[own].sum()) / scale + _CHART_PRICE * new
