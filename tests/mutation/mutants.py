@@ -358,8 +358,8 @@ TOOLKIT = (
         "weights of remembered poses",
         "missing square",
         "toolkit/memory.py",
-        "torch.softmax(-(near**2) / (2 * self.width**2), 0)",
-        "torch.softmax(-near / (2 * self.width**2), 0)",
+        "(first - near) * (first + near) / (2 * width**2)",
+        "(first - near) / (2 * width**2)",
         _toolkit("memory"),
     ),
 )
