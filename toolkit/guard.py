@@ -134,27 +134,26 @@ def diagnose(trainer: "Trainer", step: int, done: float, state: Tensor) -> BadSt
     """
     with unchanged(trainer):
         trainer.generator.set_state(state)
-        batch, shape = trainer.draw(step, done)
-        terms, out = trainer.losses_of((batch, shape), step, done)
+        drawn = trainer.draw(step, done)
+        terms, out = trainer.losses_of(drawn, step, done)
     named = dict(trainer.avatar.model.named_parameters())
     bad = [n for n, t in terms.items() if not math.isfinite(float(t.detach()))]
     inner = dict(_inner(out))
     tensors = [n for n, (t, _) in inner.items() if not bool(t.isfinite().all())]
-    rows = [r for n in tensors for r in _rows(inner[n][0], inner[n][1])]
+    rows = [r for n in tensors for r in _rows(*inner[n])]
+    watched = [(tensor, rays) for tensor, rays in inner.values() if tensor.requires_grad]
+    wanted = [tensor for tensor, _ in watched] + list(named.values())
     for name, term in terms.items():
-        wanted = [t for t, _ in inner.values() if t.requires_grad] + list(named.values())
         if not term.requires_grad:
             continue
         found = torch.autograd.grad(term, wanted, retain_graph=True, allow_unused=True)
-        marks = [i for i, _ in inner.values() if i.requires_grad]
-        sources = [s for t, s in inner.values() if t.requires_grad]
-        for grad, source in zip(found[: len(marks)], sources, strict=True):
+        for grad, (_, rays) in zip(found, watched, strict=False):  # those of the weights follow
             if grad is not None and not _sound(grad):
-                rows += _rows(grad, source)
-        at = [n for n, g in zip(named, found[len(marks) :], strict=True) if not _sound(g)]
+                rows += _rows(grad, rays)
+        at = [n for n, g in zip(named, found[len(watched) :], strict=True) if not _sound(g)]
         tensors += [f"gradient of {n}" for n in at if f"gradient of {n}" not in tensors]
         bad += [name] if at and name not in bad else []
-    where = _where(trainer, batch, rows)
+    where = _where(trainer, drawn[0], rows)
     return BadStep(step, tuple(bad), tuple(tensors), *where, repeated=bool(bad or tensors))
 
 

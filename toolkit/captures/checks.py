@@ -185,14 +185,9 @@ def _vertex_error(record: CaptureRecord) -> float | None:
 
 def _on_mask(record: CaptureRecord, pair: tuple[int, int], on: Tensor) -> float:
     """Share of the body's vertices that fall on the mask."""
-    camera = record.cameras[pair[0]]
-    verts = _verts_world(record, pair[1])
-    pixels, _ = camera.project(verts)
-    seen = camera.visible(verts)
-    column, row = pixels[seen].floor().long().unbind(-1)
-    share = float(on[row, column].sum()) / len(verts)
+    share, seen = share_on_mask(record, pair, on)
     if share < MIN_ON_MASK:
-        inside = 100 * len(row) / len(verts)
+        inside = 100 * len(seen) / record.body.num_verts
         raise InputError(
             f"{record.root / 'annots.npy'}: expected the body of frame {pair[1]} on the mask of "
             f"camera {pair[0]}, found {100 * share:.0f} % of it there ({inside:.0f} % in the "
@@ -200,6 +195,22 @@ def _on_mask(record: CaptureRecord, pair: tuple[int, int], on: Tensor) -> float:
             f"{describe_size(record.image_size)}"
         )
     return share
+
+
+def share_on_mask(
+    record: CaptureRecord, pair: tuple[int, int], on: Bool[Tensor, "h w"]
+) -> tuple[float, Float[Tensor, "n 2"]]:
+    """Share of the body's vertices that fall on a mask, and the pixels of those in the image.
+
+    Args:
+        record: the capture.
+        pair: camera and frame.
+        on: the mask.
+    """
+    camera, verts = record.cameras[pair[0]], _verts_world(record, pair[1])
+    pixels = camera.project(verts)[0][camera.visible(verts)].cpu()
+    column, row = pixels.floor().long().unbind(-1)
+    return float(on[row, column].sum()) / len(verts), pixels
 
 
 def _verts_world(record: CaptureRecord, frame: int) -> Float[Tensor, "v 3"]:

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from .cache import Pictures
+from .checks import share_on_mask
 from .records import CaptureRecord
 
 DARK, BRIGHT = 4.0, 251.0
@@ -83,16 +84,12 @@ def _off_body(record: CaptureRecord, pictures: Pictures, pairs: list[tuple[int, 
     """Bodies that lie off their masks, and masks that show more than a body."""
     on, within = [], []
     for row in range(0, len(pairs), max(1, len(pairs) // LOOKED_AT)):
-        camera, mask = record.cameras[pairs[row][0]], pictures.masks[row]
-        verts = record.body(record.poses[pairs[row][1]]).verts_world
-        pixels = camera.project(verts)[0].cpu()
-        seen = camera.visible(verts).cpu()
-        if not bool(seen.any()) or not bool(mask.any()):
-            on.append(0.0)
+        mask = pictures.masks[row]
+        share, pixels = share_on_mask(record, pairs[row], mask)
+        on.append(share)
+        if not len(pixels) or not bool(mask.any()):
             continue
-        column, line = pixels[seen].floor().long().unbind(-1)
-        on.append(float(mask[line, column].sum()) / len(verts))
-        low, high = pixels[seen].amin(0), pixels[seen].amax(0)
+        low, high = pixels.amin(0), pixels.amax(0)
         border = MARGIN * float((high - low).amax())
         place = mask.nonzero().flip(-1) + 0.5
         inside = ((place > low - border) & (place < high + border)).all(-1)
