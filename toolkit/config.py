@@ -171,7 +171,10 @@ class TrainConfig:
     iterations: int = 1500
     """Steps; used when no time is given."""
     seconds: float | None = None
-    """Wall-clock budget of the loop, seconds; takes the place of `iterations`."""
+    """Budget of the loop, seconds; takes the place of `iterations`."""
+    clock: Literal["wall", "cpu"] = "wall"
+    """What `seconds` counts: time, or processor time, which other work on the machine leaves
+    alone."""
     rays: int = 2048
     """Random pixels of a step, over all training frames."""
     patch: int = 64

@@ -319,8 +319,10 @@ class Trainer:
         saved = time.perf_counter()
         step = result.iterations
         while True:
-            elapsed = time.perf_counter() - start
-            done = elapsed / config.seconds if config.seconds else step / config.iterations
+            spent = time.process_time() - cpu
+            if config.clock == "wall":
+                spent = time.perf_counter() - start
+            done = spent / config.seconds if config.seconds else step / config.iterations
             if done >= 1.0:
                 break
             with repeatable(config.deterministic):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -34,6 +35,20 @@ def test_what_is_saved_renders_bitwise_the_same(small_capture, tmp_path, prior):
             assert torch.equal(getattr(kept, name), getattr(back, name)), name
         assert kept.stats == back.stats
     assert not torch.equal(fresh, render_view(loaded, view_of(record, 1, 0)).color), "trained"
+
+
+@pytest.mark.parametrize(("clock", "steps"), [("wall", 2), ("cpu", 5)])
+def test_a_budget_counts_the_clock_that_is_named(small_capture, monkeypatch, clock, steps):
+    settings = [[*TINY, f"train.clock={clock}"]]
+    config = resolve("tiny", settings, seconds=10.0)
+    trainer = Trainer(Avatar.create(read_capture(small_capture), config), None)
+    monkeypatch.setattr(trainer, "step", lambda step, done: {})
+    # Another program has most of the machine: five seconds go by for two of work.
+    wall = lambda: 5.0 * trainer.result.iterations  # noqa: E731
+    work = lambda: 2.0 * trainer.result.iterations  # noqa: E731
+    clocks = SimpleNamespace(perf_counter=wall, process_time=work)
+    monkeypatch.setattr("monopart.toolkit.train.time", clocks)
+    assert trainer.loop().iterations == steps
 
 
 def test_names_of_new_runs(tmp_path):
