@@ -4,9 +4,12 @@ import pytest
 import torch
 
 from monopart.geometry.body import BodyModel
+from monopart.geometry.camera_paths import orbit_cameras, ring_of_cameras
 from monopart.geometry.cameras import Camera, Rays
 from monopart.geometry.culling import BodyShell
 from monopart.geometry.diffused_weights import DiffusedField
+from monopart.geometry.errors import InputError
+from monopart.geometry.norms import brought_to_one
 
 
 @pytest.mark.parametrize(("lens", "count"), [("brown", 5), ("brown", 14), ("fisheye", 4)])
@@ -42,3 +45,46 @@ def test_diffused_weights_of_points_that_are_not_finite_are_zero() -> None:
         1.0, abs=1e-5
     )
     assert gradient.isfinite().all() and not gradient[:2].any()
+
+
+@pytest.mark.parametrize("length", [1e-30, 1e-20, 1e25, 3e38])
+def test_directions_upwards_may_have_any_length(length: float) -> None:
+    up, eye, target = torch.tensor([0.2, 1.0, -0.3]), torch.tensor([0.0, 0, 3]), torch.zeros(3)
+    plain, long = (Camera.look_at(eye, target, u, (8, 8), fov=1.0) for u in (up, length * up))
+    torch.testing.assert_close(long.R, plain.R, rtol=0, atol=1e-6)
+    rings = [ring_of_cameras(target, u, 2.0, 0.3, 3, (8, 8), 1.0) for u in (up, length * up)]
+    orbits = [orbit_cameras(plain, target, u, 3) for u in (up, length * up)]
+    for one, two in (rings, orbits):
+        for a, b in zip(one, two, strict=True):
+            torch.testing.assert_close(a.R, b.R, rtol=0, atol=1e-6)
+    for made in (orbits[0], rings[0]):
+        assert float((made[1].R - made[0].R).norm()) > 1.0  # an axis lost to overflow turns nothing
+
+
+@pytest.mark.parametrize("up", [0.0, torch.nan, torch.inf])
+def test_directions_upwards_that_are_none_are_refused(up: float) -> None:
+    eye, wrong = torch.tensor([0.0, 0, 3]), torch.full((3,), up)
+    camera = Camera.look_at(eye, torch.zeros(3), torch.tensor([0.0, 1, 0]), (8, 8), fov=1.0)
+    with pytest.raises(InputError, match="up"):
+        Camera.look_at(eye, torch.zeros(3), wrong, (8, 8), fov=1.0)
+    with pytest.raises(InputError, match="up"):
+        orbit_cameras(camera, torch.zeros(3), wrong, 3)
+    with pytest.raises(InputError, match="up"):
+        ring_of_cameras(torch.zeros(3), wrong, 2.0, 0.3, 3, (8, 8), 1.0)
+
+
+def test_the_first_camera_of_an_orbit_is_the_given_one_anywhere() -> None:
+    eye = torch.tensor([0.0, 0, 3])
+    camera = Camera.look_at(eye, torch.zeros(3), torch.tensor([0.1, 1, 0]), (8, 8), fov=1.0)
+    far = torch.tensor([1e5, 3e4, -2e4])
+    assert torch.equal(orbit_cameras(camera, far, torch.tensor([0.3, 1, 0]), 4)[0].t, camera.t)
+
+
+def test_a_direction_keeps_its_digits_and_its_gradient() -> None:
+    vectors = torch.tensor([[3.0, -6, 0.1], [1e-30, 2e-30, 0], [0, 0, 0]], dtype=torch.float64)
+    scaled = brought_to_one(vectors)
+    factor = scaled[:2, :2] / vectors[:2, :2]
+    assert torch.equal(factor[:, 0], factor[:, 1]), "all entries by the same power of two"
+    assert torch.equal(factor.log2(), factor.log2().round()) and not scaled[2].any()
+    one = vectors[:1].clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: brought_to_one(v) / brought_to_one(v).norm(), one)
