@@ -342,7 +342,7 @@ def _prior() -> Stress:
 
 def stresses() -> list[Stress]:
     """Operations on encodings, networks and grids."""
-    from . import stability_learned
+    from . import stability_fusion, stability_learned
 
     own = [_grids(), _frequency(), _networks(), _residual(), _occupancy(), _prior()]
-    return [*own, *stability_learned.stresses()]
+    return [*own, *stability_learned.stresses(), *stability_fusion.stresses()]
