@@ -10,6 +10,7 @@ from monopart.geometry.culling import BodyShell
 from monopart.geometry.diffused_weights import DiffusedField
 from monopart.geometry.errors import InputError
 from monopart.geometry.norms import brought_to_one
+from monopart.geometry.uv_texture import sample_texture
 
 
 @pytest.mark.parametrize(("lens", "count"), [("brown", 5), ("brown", 14), ("fisheye", 4)])
@@ -121,3 +122,14 @@ def test_the_jacobian_of_diffused_weights_keeps_its_digits_far_from_the_origin()
     assert bool(found.all())
     # the sum of all images would be off by their last place over a voxel: 0.016 / 0.05
     assert float((there.double() - wanted).abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf])
+def test_texture_coordinates_that_are_not_finite_have_no_colour(wrong: float) -> None:
+    texture = torch.rand(4, 4, 3, requires_grad=True)
+    uv = torch.tensor([[0.4, 0.4], [wrong, 0.5], [0.5, wrong]], requires_grad=True)
+    chart, charts = torch.zeros(3, dtype=torch.long), torch.zeros(4, 4, dtype=torch.long)
+    found = sample_texture(texture, uv, chart, charts)
+    assert found[0].all() and not found[1:].any()
+    for gradient in torch.autograd.grad(found.sum(), (texture, uv)):
+        assert gradient.isfinite().all()
