@@ -256,6 +256,7 @@ ROOMS = {
     "volume": "Compositing and parts",
     "losses": "Losses and retrieval",
     "atlas": "Textures and layouts",
+    "graphs": "Meshes as arrays",
 }
 """Groups of operations, each a module ``stability_NAME`` and a heat map."""
 
