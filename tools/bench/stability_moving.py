@@ -81,6 +81,7 @@ class _Held:
         posed = dataclasses.replace(
             posed,
             verts=posed.verts[None],
+            joints=posed.joints[None],
             transforms=posed.transforms[None],
             rotation=posed.rotation[None],
             translation=posed.translation[None],
