@@ -1,4 +1,4 @@
-"""Stress of distances along surfaces, of weights and rows of meshes, graphs and alignments."""
+"""Stress of distances along surfaces, of weights and rows of meshes, and of their graphs."""
 
 import heapq
 from collections.abc import Callable
@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from monopart.geometry.alignment import Similarity, align
 from monopart.geometry.bone_heat import heat_weights
 from monopart.geometry.geodesics import part_bands, surface_distance
 from monopart.geometry.mesh_graph import face_graph, vertex_graph
@@ -19,12 +18,12 @@ from monopart.geometry.weight_transfer import closest_faces, transfer_rows
 from .stability_atlas import sheet
 from .stability_cases import DOUBLE, Family, Inputs, Stress, Way
 from .stability_meshes import Mesh, ball, exact_distance, near, scene, soup
-from .stability_rotations import Make, exact_rotmat
+from .stability_rotations import Make
 
 # these operations take arrays: numbers of float32 reach them as such
 
 
-def _plain(run: Callable[..., np.ndarray], name: str = "monopart") -> Way:
+def plain(run: Callable[..., np.ndarray], name: str = "monopart") -> Way:
     """A way of arrays; results are compared as they come."""
 
     def on_tensors(extra: Any, *inputs: Tensor) -> Tensor:
@@ -33,13 +32,14 @@ def _plain(run: Callable[..., np.ndarray], name: str = "monopart") -> Way:
     return Way(name, on_tensors, True, differentiable=False)
 
 
-def _moved(mesh: Mesh, size: float = 1.0, away: float = 0.0) -> Make:
+def moved(mesh: Mesh, size: float = 1.0, away: float = 0.0) -> Make:
+    """The vertices of a mesh in another size and place."""
     return lambda g, n: (size * mesh.verts + away,)
 
 
 def _sizes(mesh: Mesh, extra: Any) -> list[Family]:
     shapes = (("1 m", 1.0, 0.0), ("1e-6 m", 1e-6, 0.0), ("1e6 m", 1e6, 0.0), ("1 km off", 1.0, 1e3))
-    return [Family(n, _moved(mesh, s, a), extra=extra) for n, s, a in shapes]
+    return [Family(n, moved(mesh, s, a), extra=extra) for n, s, a in shapes]
 
 
 def _extent(extra: Any, exact: np.ndarray, verts: np.ndarray, *rest: np.ndarray) -> float:
@@ -63,15 +63,15 @@ def _geodesics() -> Stress:
         return np.abs(verts[:, 1] - verts[:, 1].min())
 
     families = _sizes(flat, flat)
-    families += [Family("folded", _moved(folded), extra=folded)]
-    families += [Family("every corner its own vertex", _moved(doubled), extra=doubled)]
+    families += [Family("folded", moved(folded), extra=folded)]
+    families += [Family("every corner its own vertex", moved(doubled), extra=doubled)]
     return Stress(
         name="surface_distance",
         title="distances along a surface",
         domain="finite meshes of any size (others are an error); infinite where no way leads",
         error="largest coordinate",
         families=tuple(families),
-        ways=(_plain(run),),
+        ways=(plain(run),),
         exact=exact,
         scale=_extent,
         wrt=(),
@@ -102,8 +102,8 @@ def _bands() -> Stress:
         title="bands where parts overlap (shares)",
         domain="finite meshes of any size; as good as the last place of a vertex over the width",
         error="1, and the place over the width",
-        families=tuple(Family(n, _moved(mesh, s, a), extra=s) for n, s, a in shapes),
-        ways=(_plain(run),),
+        families=tuple(Family(n, moved(mesh, s, a), extra=s) for n, s, a in shapes),
+        ways=(plain(run),),
         exact=exact,
         scale=lambda size, exact, verts: 4 * max(1.0, np.abs(verts).max() / size),
         wrt=(),
@@ -147,7 +147,7 @@ def _graphs() -> Stress:
         domain="finite meshes; as good as the last place of a vertex over the length of an edge",
         error="the sum, and the place over the length of an edge (0.1 of the size)",
         families=tuple(_sizes(mesh, mesh.faces)),
-        ways=(_plain(run),),
+        ways=(plain(run),),
         exact=lambda faces, verts: _exact_graphs(faces.numpy(), verts),
         off=off,
         scale=lambda faces, exact, verts: 20 * np.abs(verts).max() / np.ptp(verts, axis=0).max(),
@@ -197,7 +197,7 @@ def _labels() -> Stress:
         "largest cost",
         error="largest cost (1000 m) over 2²⁸",
         families=tuple(Family(n, costs(s)) for n, s in shapes),
-        ways=(_plain(run),),
+        ways=(plain(run),),
         exact=exact,
         scale=lambda extra, exact, costs: 1e3,
         wrt=(),
@@ -291,8 +291,8 @@ def _heat() -> Stress:
         title="weights by heat (sum and sign)",
         domain="finite meshes of any size; a piece that sees no bone keeps to the nearest",
         error="1",
-        families=tuple(Family(n, _moved(mesh, s, a), extra=(s, a)) for n, s, a in shapes),
-        ways=(_plain(run),),
+        families=tuple(Family(n, moved(mesh, s, a), extra=(s, a)) for n, s, a in shapes),
+        ways=(plain(run),),
         exact=lambda given, verts: np.zeros((len(verts), 2)),
         wrt=(),
         cases=8,
@@ -326,7 +326,7 @@ def _rows() -> Stress:
         domain="finite meshes (others are an error); rows as good as the last place of a vertex",
         error="largest coordinate",
         families=tuple(_sizes(mesh, mesh.faces)),
-        ways=(_plain(run),),
+        ways=(plain(run),),
         exact=lambda faces, verts: np.zeros((len(verts) + len(faces), 3)),
         scale=_extent,
         wrt=(),
@@ -357,7 +357,7 @@ def _closest() -> Stress:
         domain="finite points and meshes (others are an error); on needles libigl loses digits",
         error="largest coordinate of mesh and point; 1e-8 on the surface, the root of a square",
         families=tuple(families),
-        ways=(_plain(run),),
+        ways=(plain(run),),
         exact=exact_distance,
         scale=scene,
         wrt=(),
@@ -366,66 +366,9 @@ def _closest() -> Stress:
     )
 
 
-# --- laying one mesh on another ----------------------------------------------------------------
-
-
-def _similar() -> Stress:
-    """There and back, and the formula."""
-
-    def run(given: tuple[float, float], points: Tensor) -> Tensor:
-        turn = exact_rotmat(None, np.array([[0.3, -1.0, 0.7]]))[0]
-        move = Similarity(given[0], turn, np.full(3, given[1]))
-        there = move(points.double().numpy())
-        return torch.from_numpy(np.concatenate((there, move.inverse()(there)), 1))
-
-    def exact(given: tuple[float, float], points: np.ndarray) -> np.ndarray:
-        turn = exact_rotmat(None, np.array([[0.3, -1.0, 0.7]]))[0]
-        moved = np.stack([given[0] * (turn @ p) for p in points]) + given[1]
-        return np.concatenate((moved, points), 1)
-
-    shapes = (("1", 1.0, 1.0), ("1e-6", 1e-6, 0.0), ("1e6", 1e6, 0.0), ("1 km off", 1.0, 1e3))
-    make = lambda g, n: (torch.randn(n, 3, generator=g, dtype=DOUBLE),)  # noqa: E731
-    return Stress(
-        name="similarity",
-        title="similarities, there and back",
-        domain="any scale above 0; the way back is as good as the last place of the way there",
-        error="1, and the place over the scale",
-        families=tuple(Family(f"scale {n}", make, extra=(s, a)) for n, s, a in shapes),
-        ways=(Way("monopart", run, True, differentiable=False),),
-        exact=exact,
-        scale=lambda given, exact, p: 8 * max(1.0, given[0], given[1] / given[0]),
-        wrt=(),
-        cases=64,
-    )
-
-
-def _align() -> Stress:
-    """A ball with bumps found again after a turn, in another size and place."""
-
-    def run(given: tuple[float, float], verts: np.ndarray) -> np.ndarray:
-        mesh, turn = ball(), exact_rotmat(None, np.array([[0.2, 0.3, -0.1]]))[0]
-        shape = verts * np.array([1.0, 1.6, 0.7])
-        there = given[0] * shape @ turn.T + given[1]
-        found = align((shape, mesh.faces.numpy()), (there, mesh.faces.numpy()))
-        return (found(shape) - there) / given[0]
-
-    shapes = (("1e-6", 1e-6, 0.0), ("1, 1 km off", 1.0, 1e3))
-    return Stress(
-        name="align",
-        title="one mesh laid on another",
-        domain="meshes of one shape, of any size and place; good to the spacing of its 1500 points",
-        error="the size of the mesh",
-        families=tuple(Family(f"size {n}", _moved(ball()), extra=(s, a)) for n, s, a in shapes),
-        ways=(_plain(run),),
-        exact=lambda given, verts: np.zeros_like(verts),
-        wrt=(),
-        cases=8,
-        limit=0.05,
-        double=0.05,
-    )
-
-
 def stresses() -> list[Stress]:
     """Operations on meshes as arrays."""
+    from . import stability_alignment
+
     own = [_geodesics(), _bands(), _graphs(), _labels(), _joint_parts(), _heat(), _rows()]
-    return [*own, _closest(), _similar(), _align()]
+    return [*own, _closest(), *stability_alignment.stresses()]

@@ -381,7 +381,8 @@ def _unskin_parts() -> Stress:
 
 def stresses() -> list[Stress]:
     """Operations on bodies in space."""
-    from . import stability_moving
+    from . import stability_diffused, stability_moving
 
     own = [_signed(), *_shell_rays(), _diffused_weights(), _all_roots(), _pairs()]
-    return [*own, _unskin_parts(), *stability_moving.stresses()]
+    own += [_unskin_parts(), *stability_moving.stresses()]
+    return [*own, *stability_diffused.stresses()]
