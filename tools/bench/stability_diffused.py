@@ -78,7 +78,7 @@ def exact_field(extra: None, points: np.ndarray, transforms: np.ndarray) -> np.n
     grid = diffused(DOUBLE).grid
     points = np.nan_to_num(points, posinf=0.0)
     low = np.floor((points - np.array(grid.lo)) / grid.voxel + 1e-6)
-    inside = ((low >= 0) & (low < np.array(grid.size))).all(1)
+    inside = np.asarray(((low >= 0) & (low < np.array(grid.size))).all(1))
     x, y, z = np.where(inside[:, None], low, 0).astype(np.int64).T
     slot = grid.slots.numpy()[(z * grid.size[1] + y) * grid.size[0] + x]
     cells = grid.cells.numpy()[np.maximum(slot, 0)]
@@ -86,7 +86,7 @@ def exact_field(extra: None, points: np.ndarray, transforms: np.ndarray) -> np.n
     columns = [_image(points, cells, low, maps)]
     for axis in range(3):
         moved = points + 1e-30j * np.eye(3)[axis]
-        columns.append(_image(moved, cells, low, maps).imag / 1e-30)
+        columns.append(np.imag(_image(moved, cells, low, maps)) / 1e-30)
     return np.concatenate((columns[0], np.stack(columns[1:], 2).reshape(-1, 9)), 1)
 
 

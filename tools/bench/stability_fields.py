@@ -171,7 +171,7 @@ class Nets:
         return self.double if ref.dtype == DOUBLE else self.single
 
 
-def exact_layers(mlp: PartMLP, x: np.ndarray) -> np.ndarray:
+def exact_layers(mlp: Any, x: np.ndarray) -> np.ndarray:
     """Layers by matrix products in float64."""
     last = len(mlp.weights) - 1
     for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):

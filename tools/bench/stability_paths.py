@@ -26,7 +26,7 @@ def _row(camera: Camera, reach: Tensor) -> Tensor:
     return torch.cat((camera.R.flatten(), camera.t / (1 + reach.abs().max())))
 
 
-def _exact_row(R: np.ndarray, t: np.ndarray, reach: np.ndarray) -> np.ndarray:
+def _exact_row(R: Any, t: Any, reach: Any) -> np.ndarray:
     return np.concatenate((R.ravel(), t / (1 + np.abs(reach).max())))
 
 
@@ -131,7 +131,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return scaled / np.linalg.norm(scaled)
 
 
-def _orbited(path: _Path, R: np.ndarray, t: np.ndarray, middle: np.ndarray, up: np.ndarray) -> Any:
+def _orbited(path: _Path, R: Any, t: Any, middle: Any, up: Any) -> tuple[Any, Any]:
     """Turn a camera about an axis through a point: with 50 digits."""
     angle = 2 * math.pi * path.index / path.count
     turn = exact_rotmat(None, (angle * _unit(up))[None])[0]
@@ -152,7 +152,7 @@ def _orbit() -> Stress:
     def exact(path: _Path, center: np.ndarray, up: np.ndarray) -> np.ndarray:
         R, t = camera().R.numpy(), camera().t.numpy()
         pairs = zip(center, up, strict=True)
-        return np.stack([_exact_row(*_orbited(path, R, t, c, u), c) for c, u in pairs])
+        return np.stack([_exact_row(*_orbited(path, R, t, c, u), reach=c) for c, u in pairs])
 
     third = _Path(3, 1)
     shapes = (
