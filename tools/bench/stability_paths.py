@@ -240,8 +240,8 @@ def _blend() -> Stress:
         for v, w, p, q in zip(first, turn, a, b, strict=True):
             R = axis_angle_to_rotmat(v)
             there = axis_angle_to_rotmat(w) @ R
-            ends = (Camera(K, r, -(r @ c), (8, 8)) for r, c in ((R, p), (there, q)))
-            rows.append(_row(blend_cameras(*ends, path.count)[path.index], p))
+            start, end = (Camera(K, r, -(r @ c), (8, 8)) for r, c in ((R, p), (there, q)))
+            rows.append(_row(blend_cameras(start, end, path.count)[path.index], p))
         return torch.stack(rows)
 
     def exact(extra: None, first: np.ndarray, turn: np.ndarray, *ends: np.ndarray) -> np.ndarray:
