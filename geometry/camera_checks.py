@@ -8,6 +8,7 @@ from torch import Tensor
 
 from .errors import InputError
 from .lenses import check_lens
+from .norms import brought_to_one
 
 
 def check_size(size: tuple[int, int]) -> None:
@@ -67,13 +68,14 @@ def look_at_rotation(
     >>> look_at_rotation(torch.zeros(3), y, z).tolist()
     [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
     """
-    forward = target - eye
-    right = torch.linalg.cross(forward, up)
-    sine = right.detach().norm() / (forward.norm() * up.norm()).detach()
+    # lengths of the view and of up do not matter: without them no square overflows or vanishes
+    forward, upwards = brought_to_one(target - eye), brought_to_one(up)
+    right = torch.linalg.cross(forward, upwards)
+    sine = right.detach().norm() / (forward.norm() * upwards.norm()).detach()
     if not float(sine) > 1e-6:
         raise InputError(
             f"look_at: expected up not along the view, found up {up.tolist()} and view "
-            f"{forward.tolist()}; move the target or choose another up"
+            f"{(target - eye).tolist()}; move the target or choose another up"
         )
     z = forward / forward.norm()
     x = right / right.norm()

@@ -9,7 +9,17 @@ from torch import Tensor
 
 from .cameras import Camera
 from .errors import InputError
+from .norms import brought_to_one
 from .rotations import axis_angle_to_rotmat, rotmat_to_axis_angle
+
+
+def _axis(up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """Unit vector of a direction of any finite length."""
+    scaled = brought_to_one(up)
+    length = scaled.norm()
+    if not bool((length > 0) & length.isfinite()):
+        raise InputError(f"up: expected a direction, found {up.tolist()}; pass e.g. (0, 0, 1)")
+    return scaled / length
 
 
 def orbit_cameras(
@@ -30,12 +40,9 @@ def orbit_cameras(
     Raises:
         InputError: a count below one, an axis of zero length.
     """
-    length = float(up.norm())
     if count < 1:
         raise InputError(f"count: expected at least one camera, found {count}; pass count >= 1")
-    if not length > 0:
-        raise InputError(f"up: expected a direction, found {up.tolist()}; pass e.g. (0, 0, 1)")
-    axis, pivot = (up / length).to(camera.K), center.to(camera.K)
+    axis, pivot = _axis(up).to(camera.K), center.to(camera.K)
     cross = torch.linalg.cross(axis.expand(3, 3), torch.eye(3).to(axis)).mT
     cameras = []
     for i in range(count):
@@ -44,7 +51,7 @@ def orbit_cameras(
         turn = turn + (1 - math.cos(angle)) * (cross @ cross)
         # x = pivot + turn (x0 - pivot) undone before the first camera's R and t
         R = camera.R @ turn.mT
-        t = camera.t + camera.R @ pivot - R @ pivot
+        t = camera.t + (camera.R - R) @ pivot  # one difference: nothing is left of it at the start
         cameras.append(dataclasses.replace(camera, R=R, t=t))
     return cameras
 
@@ -83,9 +90,7 @@ def ring_of_cameras(
         raise InputError(f"distance: expected metres above 0, found {distance}; give a length")
     if not abs(elevation) < math.pi / 2:
         raise InputError(f"elevation: expected radians within π/2, found {elevation}; lower it")
-    if not float(up.norm()) > 0:
-        raise InputError(f"up: expected a direction, found {up.tolist()}; pass e.g. (0, 0, 1)")
-    axis = up / up.norm()
+    axis = _axis(up)
     # any direction across the axis will do: the world axis farthest from it is the steadiest
     other = torch.zeros_like(axis)
     other[int(axis.abs().argmin())] = 1

@@ -34,18 +34,20 @@ class CellPoint:
     Attributes:
         image: [N, 3] posed points, metres.
         linear: [N, 3, 3] linear part of the blended maps.
-        corner_images: [N, 8, 3] the points under the map of each corner of the cell.
+        corner_shifts: [N, 8, 3] the points under the map of each corner of the cell, less those
+            under that of the first: what all corners have in common cancels in the Jacobian, and
+            would cost its digits.
         gradients: [N, 8, 3] gradients of the trilinear shares, 1/metre.
     """
 
     image: Float[Tensor, "n 3"]
     linear: Float[Tensor, "n 3 3"]
-    corner_images: Float[Tensor, "n 8 3"]
+    corner_shifts: Float[Tensor, "n 8 3"]
     gradients: Float[Tensor, "n 8 3"]
 
     def jacobian(self) -> Float[Tensor, "n 3 3"]:
         """The Jacobian of the image in the points, analytic, the cell held."""
-        turn = self.corner_images[..., :, None] * self.gradients[..., None, :]
+        turn = self.corner_shifts[..., :, None] * self.gradients[..., None, :]
         return self.linear + turn.sum(1)
 
 
@@ -144,12 +146,20 @@ class DiffusedField(SkinningField):
         maps: Float[Tensor, "m 3 4"],
         rest: Float[Tensor, "V 3"] | None = None,
     ) -> CellPoint:
-        """The forward field where `search` found the cell ``face``; ``rest`` is not used."""
+        """The forward field where `search` found the cell ``face``; ``rest`` is not used.
+
+        Points that are not finite, which `search` does not find, count as the origin and get no
+        gradient.
+        """
         shares, gradients = self.grid.shares(points)
+        points = torch.where(points.isfinite().all(-1, keepdim=True), points, 0.0)
         corners = maps[self.grid.cells[face]]
-        images = (corners[..., :3] * points[:, None, None, :]).sum(-1) + corners[..., 3]
-        linear = (shares[..., None, None] * corners[..., :3]).sum(1)
-        return CellPoint((shares[..., None] * images).sum(1), linear, images, gradients)
+        first, others = corners[:, 0], corners - corners[:, :1]
+        image = (first[..., :3] * points[:, None, :]).sum(-1) + first[..., 3]
+        shifts = (others[..., :3] * points[:, None, None, :]).sum(-1) + others[..., 3]
+        image = image + (shares[..., None] * shifts).sum(1)
+        linear = first[..., :3] + (shares[..., None, None] * others[..., :3]).sum(1)
+        return CellPoint(image, linear, shifts, gradients)
 
     def weights_on(
         self, points: Float[Tensor, "n 3"], face: Int[Tensor, "n"], rest: Float[Tensor, "V 3"]

@@ -109,7 +109,7 @@ def sample_texture(
 
     Args:
         texture: colours; row 0 is at v = 0.
-        uv: points.
+        uv: points; those that are not finite have no colour.
         chart: chart of each point; −1 (nothing found) has no colour.
         texel_chart: chart of each texel, (h, w); −1 between the charts.
 
@@ -131,6 +131,8 @@ def sample_texture(
             f"texture, texel_chart: expected two of one size with a texel at least, found "
             f"{tuple(texture.shape)} and {tuple(texel_chart.shape)}"
         )
+    known = uv.isfinite().all(-1) & (chart >= 0)
+    uv = torch.where(known[:, None], uv, 0.0)  # else its NaN reaches every gradient
     x, y = uv[:, 0] * width - 0.5, uv[:, 1] * height - 0.5
     left, low = x.detach().floor(), y.detach().floor()
     right, up = x - left, y - low
@@ -140,7 +142,7 @@ def sample_texture(
         for dy, along in ((0, 1 - up), (1, up)):
             column = (left + dx).long().clamp(0, width - 1)
             row = (low + dy).long().clamp(0, height - 1)
-            own = (texel_chart[row, column] == chart) & (chart >= 0)
+            own = (texel_chart[row, column] == chart) & known
             weight = torch.where(own, across * along, 0.0)[:, None]
             total = total + weight * texture[row, column]
             weights = weights + weight

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from monopart.fields.hash_grid import HashGrid
+from monopart.fields.pose_bank import PoseBank
 from monopart.geometry.body import BodyModel, BodyPose
 from monopart.geometry.cameras import Camera
 from monopart.geometry.errors import InputError, MonopartError
@@ -93,7 +94,7 @@ def save_culprit(
         rows = rows_of.get(name)
         if rows is not None:
             tensors[f"rows.{name}"] = rows
-        tensors[f"model.{name}"] = value if rows is None else value[rows]
+        tensors[f"model.{name}"] = value if rows is None else _by_row(value, name)[rows]
     for field in dataclasses.fields(BodyPose):
         rows = [getattr(record.poses[f], field.name) for f in train.frames]
         tensors[f"poses.{field.name}"] = torch.stack(rows)
@@ -125,9 +126,10 @@ def _fingerprint(body: BodyModel) -> str:
 
 
 def _touched(trainer: "Trainer", drawn: Drawn, step: int, done: float) -> dict[str, Tensor]:
-    """Rows of large tensors that a step reads: of hash tables, and cells of the occupancy."""
+    """Rows of large tensors that a step reads: of tables, key poses, cells of the occupancy."""
     model, seen, cells = trainer.avatar.model, {}, []
     grids = {n: m for n, m in model.named_modules() if isinstance(m, HashGrid)}
+    banks = {n: m for n, m in model.named_modules() if isinstance(m, PoseBank)}
     keep = model.occupancy.cells_of
 
     def remember(name: str) -> Any:
@@ -137,7 +139,8 @@ def _touched(trainer: "Trainer", drawn: Drawn, step: int, done: float) -> dict[s
         cells.append(keep(*args))
         return cells[-1]
 
-    hooks = [grid.register_forward_pre_hook(remember(name)) for name, grid in grids.items()]
+    watched = {**grids, **banks}
+    hooks = [module.register_forward_pre_hook(remember(name)) for name, module in watched.items()]
     try:
         model.occupancy.cells_of = cells_of  # type: ignore[method-assign]
         with torch.no_grad():
@@ -147,6 +150,8 @@ def _touched(trainer: "Trainer", drawn: Drawn, step: int, done: float) -> dict[s
         for hook in hooks:
             hook.remove()
     rows = {f"occupancy.{name}": torch.cat(cells).unique() for name in ("peak", "floor") if cells}
+    for name, bank in banks.items():
+        rows[f"{name}.lines"] = _key_poses(bank, [args[3] for args in seen.pop(name, [])])
     for name, calls in seen.items():
         own = grids[name].table
         used = ~own.detach().isfinite().all(-1)
@@ -158,6 +163,21 @@ def _touched(trainer: "Trainer", drawn: Drawn, step: int, done: float) -> dict[s
             used |= (grad != 0).any(-1)
         rows[f"{name}.table"] = used.nonzero().squeeze(-1)
     return rows
+
+
+def _key_poses(bank: PoseBank, calls: list[Tensor]) -> Tensor:
+    """Key poses that are read, and those that are not finite: a weight of 0 times NaN is NaN."""
+    parts, poses = bank.lines.shape[:2]
+    used = ~bank.lines.detach().flatten(2).isfinite().all(-1)
+    for rows in calls:  # [bodies, parts, key poses of each]
+        part = torch.arange(parts, device=used.device)[:, None].expand(rows.shape)
+        used[part, rows.long()] = True
+    return used.reshape(parts * poses).nonzero().squeeze(-1)
+
+
+def _by_row(value: Tensor, name: str) -> Tensor:
+    """A learned tensor with the rows first that `_touched` names: of a bank part by pose."""
+    return value.flatten(0, 1) if name.endswith(".lines") else value
 
 
 @dataclass(frozen=True)
@@ -257,7 +277,10 @@ def _whole(now: dict[str, Tensor], tensors: dict[str, Tensor]) -> dict[str, Tens
     state = {}
     for name, value in now.items():
         stored, rows = tensors[f"model.{name}"], tensors.get(f"rows.{name}")
-        state[name] = stored if rows is None else value.index_copy(0, rows, stored)
+        if rows is None:
+            state[name] = stored
+        else:
+            state[name] = _by_row(value, name).index_copy(0, rows, stored).view(value.shape)
     return state
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from miniature import write_miniature
+from safetensors import safe_open
 from safetensors.torch import save_file
 from training import TINY
 
@@ -118,6 +119,40 @@ def test_the_stored_step_is_the_step(capture: Path, tmp_path: Path) -> None:
     trainer.avatar.model.train()
     terms, _ = trainer.losses(1, 0.1)
     assert set(again) == set(terms) and math.isnan(again["mse"])
+    for name, value in terms.items():
+        assert again[name] == float(value.detach()) or math.isnan(again[name])
+
+
+def test_of_the_pose_bank_only_the_key_poses_that_are_read_are_stored(tmp_path: Path) -> None:
+    capture = write_miniature(tmp_path / "long", frames=13, size=24)  # a pose reads five of 12
+    settings = ("train.rays=1", "train.patch=2", "appearance.pose_feature=true")
+    trainer = trainer_of(capture, tmp_path / "run", *settings)
+    bank = trainer.avatar.model.appearance.bank
+    assert bank is not None
+    with torch.no_grad():
+        bank.lines += 0.1 * torch.randn(bank.lines.shape)  # else all key poses are the same
+        bank.lines[2, 1, 0, 0, 0] = math.nan
+        dict(trainer.avatar.model.named_parameters())["field.density_mlp.biases.1"][:] = math.nan
+    number, state = 0, trainer.generator.get_state()
+    while not trainer.result.bad_steps and number < 20:  # until the ray meets the body
+        number, state = number + 1, trainer.generator.get_state()
+        trainer.step(number, 0.1)
+    file = tmp_path / "run" / trainer.result.bad_steps[0]["file"]
+    with safe_open(file, framework="pt") as stored:
+        rows = stored.get_tensor("rows.appearance.bank.lines")
+        kept = stored.get_tensor("model.appearance.bank.lines")
+    parts, poses = bank.lines.shape[:2]
+    assert 0 < len(rows) == len(kept) < parts * poses and 2 * poses + 1 in rows.tolist()
+    assert torch.equal(kept.nan_to_num(9.0), bank.lines.flatten(0, 1)[rows].nan_to_num(9.0))
+    culprit = load_culprit(file)
+    loaded = culprit.trainer.avatar.model.appearance.bank
+    assert loaded is not None
+    missing = sorted(set(range(parts * poses)) - set(rows.tolist()))
+    assert loaded.lines.flatten(0, 1)[missing].isfinite().all()
+    again, _ = culprit.repeat()
+    trainer.generator.set_state(state)
+    trainer.avatar.model.train()
+    terms, _ = trainer.losses(number, 0.1)
     for name, value in terms.items():
         assert again[name] == float(value.detach()) or math.isnan(again[name])
 

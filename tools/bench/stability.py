@@ -255,6 +255,8 @@ ROOMS = {
     "fields": "Encodings, networks, grids",
     "volume": "Compositing and parts",
     "losses": "Losses and retrieval",
+    "atlas": "Textures and layouts",
+    "graphs": "Meshes as arrays",
 }
 """Groups of operations, each a module ``stability_NAME`` and a heat map."""
 

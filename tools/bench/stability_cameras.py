@@ -17,7 +17,7 @@ from .stability_lenses import LENSES, camera, exact_lens
 from .stability_rotations import Make, axes
 
 
-def _ahead(camera: Camera, depth: tuple[float, float], spread: float) -> Make:
+def ahead(camera: Camera, depth: tuple[float, float], spread: float) -> Make:
     """World points at depths, and at a spread of x/z and y/z."""
 
     def make(generator: torch.Generator, count: int) -> Inputs:
@@ -43,7 +43,7 @@ def exact_pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
     return np.where(front, pixels, -512.0)
 
 
-def _pixel_scale(camera: Camera, exact: np.ndarray, points: np.ndarray) -> np.ndarray:
+def pixel_scale(camera: Camera, exact: np.ndarray, points: np.ndarray) -> np.ndarray:
     """What an error as large as the largest coordinate would do to a pixel, to first order."""
     R, t = camera.R.numpy(), camera.t.numpy()
     local = points @ R.T + t
@@ -82,31 +82,31 @@ def _opencv(camera: Camera, points: Tensor) -> Tensor:
 
 def _project_families() -> tuple[Family, ...]:
     plain, far = camera(), camera(away=1e5)
-    grazing = _ahead(plain, (0.1, 0.2), 500.0)
+    grazing = ahead(plain, (0.1, 0.2), 500.0)
     out = [
-        Family("3 m", _ahead(plain, (2.0, 4.0), 0.3), extra=plain, step=1e-6),
-        Family("depth 1e-2", _ahead(plain, (1e-2, 2e-2), 0.3), extra=plain, step=1e-8),
-        Family("depth 1e-5", _ahead(plain, (1e-5, 2e-5), 0.3), extra=plain, step=1e-11),
-        Family("depth 0", _ahead(plain, (0.0, 0.0), 0.3), extra=plain, smooth=False),
-        Family("behind", _ahead(plain, (-4.0, -1e-3), 0.3), extra=plain),
-        Family("1 km", _ahead(plain, (900.0, 1100.0), 0.3), extra=plain, step=1e-3),
+        Family("3 m", ahead(plain, (2.0, 4.0), 0.3), extra=plain, step=1e-6),
+        Family("depth 1e-2", ahead(plain, (1e-2, 2e-2), 0.3), extra=plain, step=1e-8),
+        Family("depth 1e-5", ahead(plain, (1e-5, 2e-5), 0.3), extra=plain, step=1e-11),
+        Family("depth 0", ahead(plain, (0.0, 0.0), 0.3), extra=plain, smooth=False),
+        Family("behind", ahead(plain, (-4.0, -1e-3), 0.3), extra=plain),
+        Family("1 km", ahead(plain, (900.0, 1100.0), 0.3), extra=plain, step=1e-3),
         Family("89.9° off axis", grazing, extra=plain, step=1e-6),
-        Family("100 km away", _ahead(far, (2.0, 4.0), 0.3), extra=far, step=1e-4),
+        Family("100 km away", ahead(far, (2.0, 4.0), 0.3), extra=far, step=1e-4),
     ]
     for name, one in (
         *(("focal 1", camera(focal=1.0)), ("focal 1e6", camera(focal=1e6))),
         ("principal point outside", camera(centre=-5000.0)),
     ):
-        out.append(Family(name, _ahead(one, (2.0, 4.0), 0.3), extra=one, step=1e-6))
+        out.append(Family(name, ahead(one, (2.0, 4.0), 0.3), extra=one, step=1e-6))
     for lens in list(LENSES)[1:]:
         one = camera(lens)
-        out.append(Family(lens, _ahead(one, (2.0, 4.0), 0.4), extra=one, step=1e-6))
-        beyond = _ahead(one, (0.2, 0.4), 20.0)
+        out.append(Family(lens, ahead(one, (2.0, 4.0), 0.4), extra=one, step=1e-6))
+        beyond = ahead(one, (0.2, 0.4), 20.0)
         out.append(Family(f"{lens}, beyond", beyond, extra=one, step=1e-7, smooth=False))
     for lens in ("usual lens", "fisheye"):
         still = camera(lens)  # at the origin: a turn would round depths away
         one = dataclasses.replace(still, R=torch.eye(3).double(), t=torch.zeros(3).double())
-        beside = _ahead(one, (1e-5, 2e-5), 1e20)
+        beside = ahead(one, (1e-5, 2e-5), 1e20)
         out.append(Family(f"{lens}, 1e15 m beside", beside, extra=one, smooth=False))
     return tuple(out)
 
@@ -125,7 +125,7 @@ def _project() -> Stress:
             Way("OpenCV", _opencv, modules=("cv2",), differentiable=False),
         ),
         exact=exact_pixels,
-        scale=_pixel_scale,
+        scale=pixel_scale,
     )
 
 
@@ -309,4 +309,8 @@ def _boxes() -> Stress:
 
 def stresses() -> list[Stress]:
     """Operations on cameras and rays."""
-    return [_project(), _rays(), _undistort(), _boxes()]
+    from . import stability_paths, stability_pixels, stability_programs
+
+    more = (stability_paths, stability_programs, stability_pixels)
+    own = [_project(), _rays(), _undistort(), _boxes()]
+    return [*own, *(stress for room in more for stress in room.stresses())]

@@ -171,7 +171,7 @@ class Nets:
         return self.double if ref.dtype == DOUBLE else self.single
 
 
-def exact_layers(mlp: PartMLP, x: np.ndarray) -> np.ndarray:
+def exact_layers(mlp: Any, x: np.ndarray) -> np.ndarray:
     """Layers by matrix products in float64."""
     last = len(mlp.weights) - 1
     for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
@@ -342,7 +342,7 @@ def _prior() -> Stress:
 
 def stresses() -> list[Stress]:
     """Operations on encodings, networks and grids."""
-    from . import stability_learned
+    from . import stability_fusion, stability_learned
 
     own = [_grids(), _frequency(), _networks(), _residual(), _occupancy(), _prior()]
-    return [*own, *stability_learned.stresses()]
+    return [*own, *stability_learned.stresses(), *stability_fusion.stresses()]

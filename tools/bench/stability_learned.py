@@ -274,7 +274,7 @@ def _table(size: float, zeros: bool = False) -> Make:
     return make
 
 
-def exact_adam(course: _Course, table: np.ndarray, grad: np.ndarray) -> np.ndarray:
+def exact_adam(course: Any, table: np.ndarray, grad: np.ndarray) -> np.ndarray:
     """Adam in float64 for each number; missed movements are added one by one."""
     (first, second), eps = AdamRule().betas, AdamRule().eps
     out = table.copy()

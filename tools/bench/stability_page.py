@@ -16,7 +16,7 @@ from .stability_heat import heat_map
 
 Rooms = Mapping[str, Sequence[Stress]]
 BEGIN, END = "<!-- stability: begin -->", "<!-- stability: end -->"
-FACTORS = {"quick": 0.1, "usual": 1.0, "exhaustive": 7.0}
+FACTORS = {"quick": 0.1, "usual": 1.0, "exhaustive": 4.5}
 """Cases of a family, in those of a usual run."""
 PROMISED = {"blend_skin", "body", "project", "rays", "undistort", "closest_point"}
 """Operations that are promised to 1e-6 in float32."""

@@ -381,5 +381,8 @@ def _unskin_parts() -> Stress:
 
 def stresses() -> list[Stress]:
     """Operations on bodies in space."""
-    own = [_signed(), *_shell_rays(), _diffused_weights()]
-    return [*own, _all_roots(), _pairs(), _unskin_parts()]
+    from . import stability_diffused, stability_moving
+
+    own = [_signed(), *_shell_rays(), _diffused_weights(), _all_roots(), _pairs()]
+    own += [_unskin_parts(), *stability_moving.stresses()]
+    return [*own, *stability_diffused.stresses()]

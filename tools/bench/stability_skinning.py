@@ -9,7 +9,7 @@ from torch import Tensor
 
 from monopart.geometry.kinematics import KinematicTree, forward_kinematics
 from monopart.geometry.rotations import axis_angle_to_rotmat
-from monopart.geometry.skinning import SkinWeights, blend_skin, blend_transforms, unskin
+from monopart.geometry.skinning import SkinWeights, blend_skin, blend_transforms, skin, unskin
 
 from .registry import load
 from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
@@ -218,6 +218,10 @@ def _skin_way(backend: Literal["warp", "torch"]) -> Way:
     return Way(f"monopart {backend}", run, True, kinds)
 
 
+def _skin_in_two(extra: _Weighted, points: Tensor, transforms: Tensor) -> Tensor:
+    return skin(points, blend_transforms(transforms, extra.like(points).dense))
+
+
 def _fixed(make: Make, count: int) -> Make:
     """The weights have a fixed number of rows, and so must the points."""
     return lambda generator, cases: make(generator, count)
@@ -255,7 +259,10 @@ def _skinning() -> Stress:
         "result, finite",
         error="largest coordinate of points and translations",
         families=_skinning_families(count),
-        ways=(_skin_way("torch"), _skin_way("warp")),
+        ways=(
+            *(_skin_way("torch"), _skin_way("warp")),
+            Way("monopart, blends first", _skin_in_two, True),
+        ),
         exact=exact_skin,
         scale=_skin_scale,
         wrt=(0, 1),

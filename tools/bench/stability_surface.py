@@ -11,8 +11,9 @@ from torch import Tensor
 from monopart.geometry.body import BodyModel
 from monopart.geometry.consistency import consistency_loss, round_trip
 from monopart.geometry.culling import BodyShell
-from monopart.geometry.surface import SurfaceIndex, vertex_normals
+from monopart.geometry.surface import SurfaceIndex, closest_point, vertex_normals
 from monopart.geometry.uv import UVMap
+from monopart.geometry.uv_lookup import UVHit
 
 from .registry import load, load_open3d
 from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
@@ -114,7 +115,7 @@ def _foot_way(backend: str) -> Way:
     """The point that was found has to be at the distance that was found, and on its face."""
 
     def run(faces: Tensor, points: Tensor, verts: Tensor) -> tuple[Tensor, Tensor]:
-        hit = SurfaceIndex(verts, faces, backend).query(points)
+        hit = closest_point(points, verts, faces, backend=backend)
         foot = (hit.bary[..., None] * verts[faces[hit.face]]).sum(1)
         return (points - foot).norm(dim=1), hit.found
 
@@ -245,7 +246,8 @@ def _uv() -> Stress:
 
     def run(table: Tensor, bary: Tensor) -> Tensor:
         face = torch.from_numpy(pick(table, bary))
-        return UVMap(table.to(bary)).at_faces(face, bary)
+        hit = UVHit(face, bary, torch.ones_like(face, dtype=torch.bool))
+        return UVMap(table.to(bary)).at(hit)
 
     def exact(table: Tensor, bary: np.ndarray) -> np.ndarray:
         return np.einsum("nc,ncd->nd", bary, table.numpy()[pick(table, bary)])
