@@ -117,6 +117,9 @@ class LossConfig:
     """Weight of the squared colour error (eq. 10)."""
     lpips: float = 0.1
     """Weight of LPIPS-VGG on patches (eq. 10)."""
+    patch_pixels: float = 0.1
+    """Weight of a pixel of a patch beside a random one in the colour errors: neighbours in one
+    picture say less than pixels of all. Where there are no random ones it has no effect."""
     consistency: float = 1.0
     """Weight of the bidirectional consistency (eq. 3)."""
     consistency_threshold: float = 0.002

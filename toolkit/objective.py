@@ -1,5 +1,7 @@
 """The objective of a training step: which terms are computed, and their weights (METHOD 8)."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -33,13 +35,31 @@ class Seen:
         color: [N, 3] rendered colours; the rows of a patch come last.
         target: [N, 3] photographed colours.
         patch: height and width of the patch, or None.
-        counted: number of rows that count; in the others color and target are equal.
+        counted: number of rows before the patch, and of the patch, that count; in the others color
+            and target are equal.
     """
 
     color: Tensor
     target: Tensor
     patch: tuple[int, int] | None
-    counted: int
+    counted: tuple[int, int]
+
+    @property
+    def random(self) -> int:
+        """Rows before those of the patch."""
+        return len(self.color) - (math.prod(self.patch) if self.patch else 0)
+
+    def mean(self, loss: Callable[[Tensor, Tensor], Tensor], patch_pixels: float) -> Tensor:
+        """A colour loss over all rows that count.
+
+        Args:
+            loss: mean over rows of colours and targets.
+            patch_pixels: weight of a row of the patch beside any other.
+        """
+        rows, weight = self.random, patch_pixels if self.random else 1.0
+        parts = ((slice(0, rows), 1.0), (slice(rows, None), weight))
+        sums = [w * len(self.color[r]) * loss(self.color[r], self.target[r]) for r, w in parts]
+        return (sums[0] + sums[1]) / max(self.counted[0] + weight * self.counted[1], 1e-9)
 
 
 def seen_batch(
@@ -53,10 +73,12 @@ def seen_batch(
         patch: height and width of the patch in the last rows, or None.
         counted: [N] on the host, False where a pixel is ignored; None: all count.
     """
+    rows = len(color) - (math.prod(patch) if patch else 0)
     if counted is None:
-        return Seen(color, target, patch, len(color))
-    known = sent(counted, color.device)[:, None]
-    return Seen(torch.where(known, color, target), target, patch, int(counted.sum()))
+        return Seen(color, target, patch, (rows, len(color) - rows))
+    known, numbers = sent(counted, color.device)[:, None], (counted[:rows], counted[rows:])
+    shown = torch.where(known, color, target)
+    return Seen(shown, target, patch, (int(numbers[0].sum()), int(numbers[1].sum())))
 
 
 class Objective:
@@ -88,15 +110,14 @@ class Objective:
         """
         spec = self.config.loss
         with stage("loss: colour"):
-            whole = len(seen.color) / max(seen.counted, 1)
             terms = {}
             if spec.mse:
-                terms["mse"] = spec.mse * whole * color_loss(seen.color, seen.target)
+                terms["mse"] = spec.mse * seen.mean(color_loss, spec.patch_pixels)
             if spec.l1:
-                terms["l1"] = spec.l1 * whole * absolute_loss(seen.color, seen.target)
+                terms["l1"] = spec.l1 * seen.mean(absolute_loss, spec.patch_pixels)
         if seen.patch is not None and lpips is not None:
             height, width = seen.patch
-            rows, shape = len(seen.color) - height * width, (1, height, width, 3)
+            rows, shape = seen.random, (1, height, width, 3)
             with stage("loss: LPIPS"):
                 shown, wanted = seen.color[rows:].reshape(shape), seen.target[rows:].reshape(shape)
                 terms["lpips"] = spec.lpips * lpips(shown.clamp(0, 1), wanted).mean()

@@ -237,11 +237,29 @@ def test_ignored_rows_are_right_and_have_no_gradient() -> None:
     color, target = torch.rand(6, 3, requires_grad=True), torch.rand(6, 3)
     counted = torch.tensor([True, False, True, True, False, True])
     seen = seen_batch(color, target, None, counted)
-    assert isinstance(seen, Seen) and seen.counted == 4
+    assert isinstance(seen, Seen) and seen.counted == (4, 0)
     loss = color_loss(seen.color, seen.target) * 6 / 4
     plain = float((color[counted] - target[counted]).square().mean().detach())
     assert float(loss.detach()) == pytest.approx(plain)
     loss.backward()
     assert color.grad is not None and not bool(color.grad[~counted].any())
     assert bool(color.grad[counted].any(-1).all())
-    assert seen_batch(color, target, None, None).counted == 6
+    assert seen_batch(color, target, None, None).counted == (6, 0)
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_pixels_of_a_patch_weigh_less_than_random_ones(ignored: bool) -> None:
+    color, target = torch.rand(7 + 6, 3), torch.rand(7 + 6, 3)
+    counted = torch.arange(13) % 4 > 0 if ignored else None
+    weight = torch.tensor([1.0] * 7 + [0.25] * 6)
+    weight = weight if counted is None else weight * counted
+    for loss, error in ((color_loss, torch.square), (absolute_loss, torch.abs)):
+        found = seen_batch(color, target, (2, 3), counted).mean(loss, 0.25)
+        wanted = (error(color - target).mean(-1) * weight).sum() / weight.sum()
+        assert float(found) == pytest.approx(float(wanted), rel=1e-5)
+    alone = seen_batch(color[7:], target[7:], (2, 3), None)
+    assert float(alone.mean(color_loss, 0.25)) == pytest.approx(
+        float(color_loss(color[7:], target[7:]))
+    ), "a patch alone weighs as it is"
+    nothing = seen_batch(color, target, (2, 3), torch.zeros(13, dtype=torch.bool))
+    assert float(nothing.mean(color_loss, 0.25)) == 0.0
