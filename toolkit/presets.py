@@ -28,6 +28,8 @@ SLOW = TrainConfig(
     occupancy=False,
 )
 """One patch of one frame a step, Adam at 5e-4, no accelerators (METHOD section 9)."""
+FASTER = 5.0
+"""Factor of a preset's learning rate from which on a training is doubted."""
 BARE = FieldConfig(prior_slope=0.0, allocation="data")
 """No density to start from; capacity by part."""
 
@@ -72,9 +74,9 @@ def _presets() -> dict[str, Config]:
     fast = Config(preset="fast")
     best = Config(
         preset="best",
-        field=FieldConfig(log2_size=17, allocation="data"),
-        loss=LossConfig(lpips=0.3),
-        train=TrainConfig(seconds=1680.0, lpips_start=0.1, lpips_every=1),
+        field=FieldConfig(log2_size=16, allocation="data"),
+        appearance=AppearanceConfig(pose_feature=True),
+        train=TrainConfig(seconds=1680.0),
     )
     tiny = Config(preset="tiny", train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0))
     rigid = Config(preset="rigid", deform=DeformConfig(residual=False))
@@ -99,6 +101,26 @@ def preset(name: str) -> Config:
         known = ", ".join(presets)
         raise InputError(f"--preset: expected one of {known}, found {name!r}; choose one of these")
     return presets[name]
+
+
+def preset_doubts(config: Config) -> list[str]:
+    """What a configuration asks for that its preset was never tried with.
+
+    Args:
+        config: a configuration, which names its preset.
+
+    Returns:
+        One sentence for each learning rate that is `FASTER` times the preset's or more.
+    """
+    usual, found = _presets().get(config.preset, Config()).train, []
+    for name in ("lr_table", "lr_network"):
+        rate, known = getattr(config.train, name), getattr(usual, name)
+        if rate >= FASTER * known:
+            found.append(
+                f"train.{name} is {rate:g}, {rate / known:.3g} times that of preset "
+                f"{config.preset} ({known:g}): the training may swing instead of settling."
+            )
+    return found
 
 
 def with_overrides(config: Config, **sections: dict) -> Config:

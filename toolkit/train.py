@@ -26,6 +26,7 @@ from .lpips import LPIPS, load_lpips
 from .model import FrameInput, Rendered
 from .objective import Objective, seen_batch
 from .optimizer import make_optimizer
+from .presets import preset_doubts
 from .refine import Posing, RefinedPoses, with_corrections
 from .replay import note_skipped
 from .resume import forget_state, save_state
@@ -79,7 +80,7 @@ class Trainer:
         self.objective = Objective(self.config, canonical)
         self.generator = torch.Generator().manual_seed(self.config.seed)
         doubts = picture_doubts(avatar.record, seen, self.config.train.patch)
-        self.result = TrainResult(warnings=doubts)
+        self.result = TrainResult(warnings=doubts + preset_doubts(self.config))
         self.lpips = self._load_lpips()
         self.optimizer = make_optimizer(avatar.model, self.config)
         self.average = [p.detach().clone() for p in avatar.model.parameters()]

@@ -12,7 +12,7 @@ from monopart.toolkit.captures import read_capture
 from monopart.toolkit.config import Config, DeformConfig
 from monopart.toolkit.optimizer import make_optimizer
 from monopart.toolkit.overrides import overridden
-from monopart.toolkit.presets import preset, preset_names
+from monopart.toolkit.presets import preset, preset_doubts, preset_names, with_overrides
 from monopart.toolkit.render import render_view
 from monopart.toolkit.train import Trainer
 
@@ -30,6 +30,17 @@ def make(capture: Path, config: Config) -> Trainer:
 
 def test_the_first_preset_is_the_default_of_everything() -> None:
     assert preset_names()[0] == "fast" and preset("fast") == Config()
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_learning_rates_far_above_the_presets_are_doubted(name: str) -> None:
+    config = preset(name)
+    assert preset_doubts(config) == []
+    rates = {"lr_table": 10 * config.train.lr_table, "lr_network": 4.9 * config.train.lr_network}
+    (doubt,) = preset_doubts(with_overrides(config, train=rates))
+    assert doubt.startswith("train.lr_table is ") and f"10 times that of preset {name}" in doubt
+    other = dataclasses.replace(config, preset="of another version")
+    assert preset_doubts(dataclasses.replace(other, train=Config().train)) == []
 
 
 @pytest.mark.parametrize("name", ["paper", "code"])

@@ -103,7 +103,7 @@ def _huge_patch(setting: Setting, generator: torch.Generator) -> Setting:
 
 CASES: dict[str, tuple[Callable[[Setting, torch.Generator], Setting], str | None]] = {
     "as it should be": (lambda setting, _: setting, None),
-    "learning rates × 10": (_fast, None),
+    "learning rates × 10": (_fast, "times that of preset"),
     "one frame": (_one_frame, "one training frame"),
     "all black": (_painted(0), "black"),
     "all white": (_painted(255), "white"),
