@@ -12,6 +12,9 @@ from .errors import InputError
 from .norms import brought_to_one
 from .rotations import axis_angle_to_rotmat, rotmat_to_axis_angle
 
+NEAR_X = 0.9
+"""Share of the first world axis in an axis from which on a ring starts from the second one."""
+
 
 def _axis(up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     """Unit vector of a direction of any finite length."""
@@ -77,7 +80,8 @@ def ring_of_cameras(
         fov: vertical field of view, radians.
 
     Returns:
-        The cameras.
+        The cameras. Where the first stands is continuous in `up`, but for a jump 26° from the first
+        world axis.
 
     Raises:
         InputError: a distance that is not positive, an elevation at the pole, no axis, no camera.
@@ -91,9 +95,9 @@ def ring_of_cameras(
     if not abs(elevation) < math.pi / 2:
         raise InputError(f"elevation: expected radians within π/2, found {elevation}; lower it")
     axis = _axis(up)
-    # any direction across the axis will do: the world axis farthest from it is the steadiest
+    # Some jump is unavoidable on a sphere: this one is far from the axes of the world.
     other = torch.zeros_like(axis)
-    other[int(axis.abs().argmin())] = 1
+    other[1 if bool(axis[0].abs() > NEAR_X) else 0] = 1
     across = torch.linalg.cross(axis, other)
     across = across / across.norm()
     arm = math.cos(elevation) * across + math.sin(elevation) * axis

@@ -133,3 +133,15 @@ def test_texture_coordinates_that_are_not_finite_have_no_colour(wrong: float) ->
     assert found[0].all() and not found[1:].any()
     for gradient in torch.autograd.grad(found.sum(), (texture, uv)):
         assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_ring_does_not_jump_where_the_axis_is_one_of_the_world(axis, sign):
+    """Its start was on the axis of the smallest entry: two of them are equally small there."""
+    target, up = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    up[axis] = sign
+    still = ring_of_cameras(target, up, 2.0, 0.3, 3, (8, 8), 1.0)[0].R
+    for way in torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64):
+        near = ring_of_cameras(target, up + 1e-7 * way, 2.0, 0.3, 3, (8, 8), 1.0)[0].R
+        assert float((near - still).abs().max()) < 1e-5

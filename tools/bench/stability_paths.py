@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from monopart.geometry.camera_paths import blend_cameras, orbit_cameras, ring_of_cameras
+from monopart.geometry.camera_paths import NEAR_X, blend_cameras, orbit_cameras, ring_of_cameras
 from monopart.geometry.cameras import Camera
 from monopart.geometry.errors import InputError
 from monopart.geometry.rotations import axis_angle_to_rotmat
@@ -189,7 +189,7 @@ def _ring() -> Stress:
         out = []
         for x, u in zip(target, up, strict=True):
             axis = _unit(u)
-            across = _unit(np.cross(axis, np.eye(3)[np.abs(u).argmin()]))
+            across = _unit(np.cross(axis, np.eye(3)[int(abs(axis[0]) > NEAR_X)]))
             arm = math.cos(path.elevation) * across + math.sin(path.elevation) * axis
             R = exact_view(path.distance * arm, np.zeros(3), axis)
             R, t = _orbited(path, R, -R @ (x + path.distance * arm), x, u)
