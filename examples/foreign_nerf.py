@@ -1,4 +1,4 @@
-"""Our consistency loss in a dynamic NeRF that knows nothing of us: ``python examples/foreign_nerf.py``.
+"""Our consistency loss in a dynamic NeRF that knows nothing of us; runs in seconds.
 
 Its warp leads from a moving scene back to a still one (D-NeRF and its followers). Colours alone
 leave it free to fold; a second warp that leads forward again, and two calls of ours, bind it.
@@ -12,9 +12,8 @@ from monopart.geometry import consistency_loss, round_trip
 
 def mlp(inputs: int) -> nn.Sequential:
     """Numbers of a sample to three numbers."""
-    return nn.Sequential(
-        nn.Linear(inputs, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 3)
-    )
+    first, second = nn.Linear(inputs, 64), nn.Linear(64, 64)
+    return nn.Sequential(first, nn.SiLU(), second, nn.SiLU(), nn.Linear(64, 3))
 
 
 def scene(points: Tensor, time: Tensor) -> Tensor:
@@ -32,17 +31,15 @@ def train(weight: float = 0.03, steps: int = 300) -> tuple[list[float], list[flo
     errors, gaps = [], []
     for _ in range(steps):
         points, time = torch.rand(512, 3) - 0.5, torch.rand(512, 1)
-
-        def to_still(p: Tensor) -> Tensor:
-            return p + backward(torch.cat([p, time], -1))
-
-        def to_moving(p: Tensor) -> Tensor:
-            return p + forward(torch.cat([p, time], -1))
-
-        error = (color(to_still(points)) - scene(points, time)).square().mean()
-        gap = round_trip(points, to_still, to_moving)
+        still = points + backward(torch.cat([points, time], -1))
+        error = (color(still) - scene(points, time)).square().mean()
+        gap = round_trip(
+            points,
+            lambda _, still=still: still,
+            lambda p, time=time: p + forward(torch.cat([p, time], -1)),
+        )
         optimizer.zero_grad()
-        (error + weight * consistency_loss(gap, 0.005)).backward()
+        (error + weight * consistency_loss(gap, threshold=0.005)).backward()
         optimizer.step()
         errors.append(error.item())
         gaps.append(gap.mean().item())
@@ -52,4 +49,4 @@ def train(weight: float = 0.03, steps: int = 300) -> tuple[list[float], list[flo
 if __name__ == "__main__":
     for weight in (0.0, 0.03):
         errors, gaps = train(weight)
-        print(f"weight {weight}: colour {errors[-1]:.4f}, there and back {1e3 * gaps[-1]:.1f} mm")
+        print(f"weight {weight}: colour {errors[-1]:.4f}, there and back {1e3 * gaps[-1]:.0f} mm")
