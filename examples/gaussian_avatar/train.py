@@ -21,8 +21,8 @@ from monopart.toolkit.video import save_png
 
 from .avatar import GaussianAvatar
 
-RATES = {"color_logits": 3e-2, "opacity_logits": 3e-2, "log_sizes": 1e-2, "quats": 1e-2}
-RATES["offsets"] = 2e-4  # metres
+RATES = {"color_logits": 0.1, "opacity_logits": 0.03, "log_sizes": 0.02, "quats": 0.01}
+RATES["offsets"] = 1e-3  # metres; the networks learn at the same
 MARGIN = 16  # pixels around the person in which a splat costs something
 
 
@@ -66,7 +66,9 @@ def train(
         seconds: at most.
         steps: at most.
     """
-    record.preload("train")
+    sizes = [record.scaled(record.scale / 2), record]  # the first half sees half the resolution
+    for size in sizes:
+        size.preload("train")
     pairs = record.split("train").pairs()
     betas = record.poses[pairs[0][1]].betas
     avatar = GaussianAvatar(record.body, betas, gaussians)
@@ -79,7 +81,7 @@ def train(
     with progress_bar("training") as update:
         while done < 1.0:
             order = order or torch.randperm(len(pairs)).tolist()
-            loss = loss_of(avatar, record, *pairs[order.pop()])
+            loss = loss_of(avatar, sizes[int(done >= 0.5)], *pairs[order.pop()])
             optimizer.zero_grad()
             loss.backward()
             for group in optimizer.param_groups:
