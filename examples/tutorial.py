@@ -43,7 +43,7 @@ def run(text: str, picture: Callable[[str, Any], None]) -> tuple[str, list[str]]
 
 def main() -> int:
     """Exit code 1 where an output differs."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--write", action="store_true", help="outputs and pictures anew")
     write = parser.parse_args().write
 

@@ -197,9 +197,11 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> Tensor:
         splats = [x.detach().float().contiguous() for x in inputs[:3]]
-        image, _ = _launch(splats, *inputs[3:], splats[0].new_zeros(0, 4), splats[0].new_zeros(0))
-        ctx.save_for_backward(*splats, *inputs[3:5], image)
-        return image.view(*inputs[5], 4)
+        starts, owner, size = inputs[3:]
+        none = splats[0].new_zeros(0, 4)
+        image, _ = _launch(splats, starts, owner, size, none, none[:, 0].contiguous())
+        ctx.save_for_backward(*splats, starts, owner, image)
+        return image.view(*size, 4)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:

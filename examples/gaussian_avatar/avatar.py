@@ -25,9 +25,10 @@ class Residual(nn.Module):
         self.encoding = FrequencyEncoding(3, octaves=4)
         self.of_place = nn.Linear(self.encoding.out_features, width)
         self.of_pose = nn.Linear(3 * joints, width, bias=False)
-        self.out = nn.Sequential(nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 3))
-        nn.init.zeros_(self.out[-1].weight)
-        nn.init.zeros_(self.out[-1].bias)
+        self.last = nn.Linear(width, 3)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+        self.out = nn.Sequential(nn.ReLU(), nn.Linear(width, width), nn.ReLU(), self.last)
 
     def forward(self, points: Tensor, pose: Tensor) -> Tensor:
         """Offsets of rest points [N, 3] in a pose [J, 3], metres."""
@@ -55,7 +56,9 @@ class GaussianAvatar(nn.Module):
         self.quats = nn.Parameter(size.new_tensor([1, 0, 0, 0]).repeat(count, 1))
         self.opacity_logits = nn.Parameter(torch.full_like(self.anchors[:, 0], 2.0))
         self.color_logits = nn.Parameter(torch.zeros_like(self.anchors))
-        self.residuals = nn.ModuleList([Residual(body.num_joints) for _ in range(2)]).to(size)
+        self.residuals = nn.ModuleList([Residual(body.num_joints) for _ in range(2)]).to(
+            size.device
+        )
 
     def rest_points(self) -> Tensor:
         """Middles of the Gaussians around the body in its rest pose, metres."""

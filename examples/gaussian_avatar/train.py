@@ -12,6 +12,7 @@ from monopart.geometry import orbit_cameras
 from monopart.toolkit.animate import world_up
 from monopart.toolkit.atomic import write_json
 from monopart.toolkit.captures import CaptureRecord, read_capture
+from monopart.toolkit.device import pick_device
 from monopart.toolkit.lpips import LPIPS, load_lpips
 from monopart.toolkit.metrics import Scores, aggregate, mask_box, score_image
 from monopart.toolkit.optimizer import Adam
@@ -32,6 +33,7 @@ def main(
     seconds: float = 60.0,
     gaussians: int = 16000,
     seed: int = 0,
+    device: str = "auto",
 ) -> None:
     """Train a Gaussian avatar; OUT receives metrics.json and pictures, truth above result.
 
@@ -41,8 +43,9 @@ def main(
         seconds: of training.
         gaussians: number of them.
         seed: of the order of the images.
+        device: cpu, cuda, cuda:N, or auto: CUDA where there is a GPU.
     """
-    record, lpips = read_capture(capture), load_lpips()
+    record, lpips = read_capture(capture).to(pick_device(device)), load_lpips()
     out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(seed)
     avatar = train(record, gaussians, seconds)
@@ -104,7 +107,8 @@ def loss_of(avatar: GaussianAvatar, record: CaptureRecord, camera: int, frame: i
     posed = record.body(pose)
     view = record.cameras[camera].cropped((left, top, right, bottom))
     image = render_gaussians(avatar(posed, pose.pose), view)
-    rows = torch.randint(len(avatar.anchors), (1024,))
+    rows = torch.randint(len(avatar.anchors), (1024,)).to(image.device)
+    truth = truth.to(image)
     loss = (image - truth).abs().mean() + avatar.inconsistency(posed, pose.pose, rows, 0.002)
     return loss + 0.2 * (1 - similarity(image[..., :3], truth[..., :3]))
 
@@ -127,7 +131,9 @@ def evaluate(
     for camera, frame in held_out_pairs(record)[split]:
         pose, mask = record.poses[frame], record.mask(camera, frame)
         image = render_gaussians(avatar(record.body(pose), pose.pose), record.cameras[camera])
-        image = (255 * image[..., :3].clamp(0, 1)).round() / 255  # what is scored is what is saved
+        image = (
+            255 * image[..., :3].cpu().clamp(0, 1)
+        ).round() / 255  # what is scored is what is saved
         truth = record.masked_image(camera, frame)
         scores.append(score_image(image, truth, mask, "strict", lpips))
         pictures.append(torch.cat([truth, image]))
@@ -143,4 +149,4 @@ def turntable(avatar: GaussianAvatar, record: CaptureRecord, views: int = 6) -> 
     center = posed.to_world(posed.joints).mean(0)
     cameras = orbit_cameras(record.cameras[train.cameras[0]], center, up, views)
     gaussians = avatar(posed, pose.pose)
-    return [render_gaussians(gaussians, camera)[..., :3].clamp(0, 1) for camera in cameras]
+    return [render_gaussians(gaussians, camera)[..., :3].cpu().clamp(0, 1) for camera in cameras]

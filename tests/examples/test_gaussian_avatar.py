@@ -1,12 +1,14 @@
 """The Gaussian avatar: binding, posing, way back, training on the carried capture."""
 
+import contextlib
 from pathlib import Path
 
 import pytest
 import torch
 from gaussian_avatar.__main__ import run
 from gaussian_avatar.avatar import REACH, GaussianAvatar, spread_over
-from gaussian_avatar.train import evaluate, train
+from gaussian_avatar.train import evaluate, train, turntable
+from pretend_cuda import DEVICE, HOST, pretend_cuda
 
 from monopart.geometry import PosedBody, SurfaceIndex
 from monopart.toolkit.captures import CaptureRecord, read_capture
@@ -70,7 +72,7 @@ def test_the_way_there_and_back(record: CaptureRecord, avatar: GaussianAvatar) -
     rows = torch.arange(0, 2000, 4)
     assert avatar.inconsistency(posed, pose, rows, REACH) < REACH + 0.05  # other limbs alone
     with torch.no_grad():
-        avatar.residuals[0].out[-1].bias.copy_(torch.tensor([0.4, 0.2, 0.0]))  # two centimetres
+        avatar.residuals[0].last.bias.copy_(torch.tensor([0.4, 0.2, 0.0]))  # two centimetres
     optimizer = torch.optim.Adam(avatar.residuals[1].parameters(), lr=1e-3)
     ways = []
     for _ in range(25):
@@ -95,6 +97,25 @@ def test_training_learns_the_person(record: CaptureRecord) -> None:
     assert (new["ssim"] or 0) > (old["ssim"] or 1) + 0.04
     assert (after["silhouette"]["psnr"] or 0) > (before["silhouette"]["psnr"] or 99) + 3
     assert len(pictures) == 15 and pictures[0].shape == (256, 128, 3)
+
+
+def test_a_gpu_gives_the_same(record: CaptureRecord) -> None:
+    """On a device that is pretended: all that training and drawing need is there."""
+    found = []
+    for where, mode in ((HOST, contextlib.nullcontext()), (DEVICE, pretend_cuda())):
+        with mode:
+            torch.manual_seed(0)
+            there = record.to(where)
+            avatar = train(there, 500, seconds=120.0, steps=2)
+            _, pictures = evaluate(avatar, there, "novel_pose", None)
+            found.append(torch.stack([*pictures[:2], *turntable_pairs(avatar, there)]))
+    assert (found[0] - found[1]).abs().max() < 0.02
+    assert found[0].max() > 0.3
+
+
+def turntable_pairs(avatar: GaussianAvatar, record: CaptureRecord) -> list[torch.Tensor]:
+    views = turntable(avatar, record, views=2)
+    return [torch.cat([view, view]) for view in views]
 
 
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
