@@ -56,9 +56,8 @@ class GaussianAvatar(nn.Module):
         self.quats = nn.Parameter(size.new_tensor([1, 0, 0, 0]).repeat(count, 1))
         self.opacity_logits = nn.Parameter(torch.full_like(self.anchors[:, 0], 2.0))
         self.color_logits = nn.Parameter(torch.zeros_like(self.anchors))
-        self.residuals = nn.ModuleList([Residual(body.num_joints) for _ in range(2)]).to(
-            size.device
-        )
+        residuals = [Residual(body.num_joints).to(size.device) for _ in range(2)]
+        self.residuals = nn.ModuleList(residuals)  # forward and backward
 
     def rest_points(self) -> Tensor:
         """Middles of the Gaussians around the body in its rest pose, metres."""

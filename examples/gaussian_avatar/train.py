@@ -69,9 +69,7 @@ def train(
         seconds: at most.
         steps: at most.
     """
-    sizes = [record.scaled(record.scale / 2), record]  # the first half sees half the resolution
-    for size in sizes:
-        size.preload("train")
+    record.preload("train")
     pairs = record.split("train").pairs()
     betas = record.poses[pairs[0][1]].betas
     avatar = GaussianAvatar(record.body, betas, gaussians)
@@ -84,7 +82,7 @@ def train(
     with progress_bar("training") as update:
         while done < 1.0:
             order = order or torch.randperm(len(pairs)).tolist()
-            loss = loss_of(avatar, sizes[int(done >= 0.5)], *pairs[order.pop()])
+            loss = loss_of(avatar, record, *pairs[order.pop()])
             optimizer.zero_grad()
             loss.backward()
             for group in optimizer.param_groups:
