@@ -1,8 +1,10 @@
 """The loss of ours in a method that is not."""
 
+import pytest
 from foreign_nerf import train
 
 
+@pytest.mark.slow
 def test_our_loss_binds_a_foreign_warp() -> None:
     """Colours are learned with it and without it; only with it the warp can be undone."""
     errors, gaps = train(weight=0.03, steps=200)

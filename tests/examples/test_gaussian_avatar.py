@@ -1,10 +1,13 @@
 """The Gaussian avatar: binding, posing, way back, training on the carried capture."""
 
 import contextlib
+import json
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
+from gaussian_avatar import train as program
 from gaussian_avatar.__main__ import run
 from gaussian_avatar.avatar import REACH, GaussianAvatar, spread_over
 from gaussian_avatar.train import evaluate, train, turntable
@@ -85,6 +88,7 @@ def test_the_way_there_and_back(record: CaptureRecord, avatar: GaussianAvatar) -
     assert ways[-1] < 0.5 * ways[0]
 
 
+@pytest.mark.slow
 def test_training_learns_the_person(record: CaptureRecord) -> None:
     """Held-out cameras at 128 x 128 pixels: what no training reaches, by far."""
     untrained = GaussianAvatar(record.body, record.poses[0].betas, 2000)
@@ -118,7 +122,25 @@ def turntable_pairs(avatar: GaussianAvatar, record: CaptureRecord) -> list[torch
     return [torch.cat([view, view]) for view in views]
 
 
-def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line(
+    record: CaptureRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All that it writes, from small images and without LPIPS."""
+    monkeypatch.setattr(program, "read_capture", lambda path: record.scaled(0.125))
+    monkeypatch.setattr(program, "load_lpips", lambda: None)
+    out = tmp_path / "deep" / "out"
+    assert run(["anywhere", "--seconds", "0.5", "--gaussians", "300", "--out", str(out)]) == 0
+    scores = json.loads((out / "metrics.json").read_text())
+    assert set(scores) == {"novel_view", "novel_pose", "novel_pose_training_camera"}
+    assert scores["novel_view"]["strict"]["full"]["psnr"] > 15
+    pictures = {p.name: cv2.imread(str(p)) for p in out.glob("*.png")}
+    assert set(pictures) == {f"{name}.png" for name in (*scores, "turntable")}
+    assert pictures["turntable.png"].shape == (64, 6 * 64, 3)
+    assert all(picture.max() > 50 for picture in pictures.values())
+
+
+def test_bad_input_ends_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run([str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")]) == 2
-    assert "nowhere" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "nowhere" in said and said.count("\n") == 1
     assert not (tmp_path / "out").exists()
