@@ -25,12 +25,17 @@ if TYPE_CHECKING:
     from .pose_bank import PoseBank as PoseBank
     from .residual import ResidualField as ResidualField
     from .row_adam import RowAdam as RowAdam
+    from .splats import Gaussians as Gaussians
+    from .splats import Splats as Splats
+    from .splats import project_gaussians as project_gaussians
+    from .splats import render_gaussians as render_gaussians
     from .volume import composite as composite
 
 _ROOM = {
     "CodeFusion": "fusion",
     "DistancePrior": "distance_prior",
     "FrequencyEncoding": "frequency",
+    "Gaussians": "splats",
     "GridSpec": "hash_grid",
     "HashGrid": "hash_grid",
     "PartField": "part_field",
@@ -40,8 +45,11 @@ _ROOM = {
     "PoseBank": "pose_bank",
     "ResidualField": "residual",
     "RowAdam": "row_adam",
+    "Splats": "splats",
     "Union": "part_union",
     "composite": "volume",
+    "project_gaussians": "splats",
+    "render_gaussians": "splats",
     "union_by_density": "part_union",
 }
 __all__ = list(_ROOM)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -1,0 +1,1 @@
+"""A Gaussian avatar on the geometry of monopart: the proof that its parts serve other methods."""
