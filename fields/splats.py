@@ -55,6 +55,8 @@ class Splats:
     """Middles, pixels (x right, y down)."""
     covariances: Float[Tensor, "n 3"]
     """Entries xx, xy, yy, square pixels, widened by `BLUR`."""
+    determinant: Float[Tensor, "n"]
+    """Of the covariances: of needles it cannot be told from their entries in float32."""
     depth: Float[Tensor, "n"]
     """Along the optical axis, metres."""
 
@@ -86,8 +88,11 @@ def project_gaussians(gaussians: Gaussians, camera: Camera) -> Splats:
     slopes = torch.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], -1).unflatten(-1, (2, 3))
     flat = camera.K.to(z)[:2, :2] @ slopes @ (camera.R.to(z) @ gaussians.factors)
     u, v = flat.unbind(1)
-    entries = [(u * u).sum(-1) + BLUR, (u * v).sum(-1), (v * v).sum(-1) + BLUR]
-    return Splats(means, torch.stack(entries, -1), depth)
+    uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
+    # Cauchy-Binet: a sum of squares, where uu vv - uv² cancels.
+    areas = torch.linalg.cross(u, v)
+    determinant = (areas * areas).sum(-1) + BLUR * (uu + vv) + BLUR**2
+    return Splats(means, torch.stack([uu + BLUR, uv, vv + BLUR], -1), determinant, depth)
 
 
 def render_gaussians(
@@ -121,7 +126,7 @@ def render_gaussians(
         return _render_gsplat(gaussians, camera)
     splats = project_gaussians(gaussians, camera)
     xx, xy, yy = splats.covariances.unbind(-1)
-    det = xx * yy - xy * xy
+    det = splats.determinant
     shapes = torch.stack([yy / det, -xy / det, xx / det, gaussians.opacity], -1)
     if chosen == "torch":
         return _blend_torch(splats, shapes, gaussians.color, camera.size)

@@ -204,3 +204,16 @@ def test_gsplat_and_cuda_agree_with_the_reference() -> None:
     assert (render_gaussians(there, on_cuda, "warp").cpu() - true).abs().max() < 1e-2
     pytest.importorskip("gsplat")
     assert (render_gaussians(there, on_cuda, "gsplat").cpu() - true).abs().max() < 2e-2
+
+
+def test_needles_of_any_length_keep_their_width() -> None:
+    """In float32 the determinant of the covariance of a long needle across the axes cancels."""
+    turn = torch.linalg.qr(torch.ones(3, 3) + torch.eye(3).double().flip(0).float())[0]
+    factors = (turn * torch.tensor([300.0, 1e-5, 1e-5]))[None]
+    needle = Gaussians(torch.zeros(1, 3), factors, torch.ones(1) * 0.5, torch.ones(1, 3))
+    exact = Gaussians(*(getattr(needle, n).double() for n in NAMES))
+    wanted = render_gaussians(exact, camera_of((16, 16), torch.float64), "torch")
+    assert 0.03 < float(wanted[..., 3].mean()) < 0.1, "a line through the picture"
+    for backend in ("torch", "warp"):
+        found = render_gaussians(needle, camera_of((16, 16)), backend)  # pyright: ignore[reportArgumentType]
+        assert float((found - wanted).abs().max()) < 1e-3

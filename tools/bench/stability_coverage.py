@@ -140,6 +140,8 @@ COVERED: dict[str, str] = {
     "RowAdam.zero_grad": "row_adam_steps",
     "RowAdam.load_state_dict": "row_adam_steps",
     "composite": "composite",
+    "project_gaussians": "project_gaussians",
+    "render_gaussians": "render_gaussians",
     "union_by_density": "part_union",
 }
 """Operation → the stress that calls it."""

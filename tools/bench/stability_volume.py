@@ -15,6 +15,7 @@ from monopart.fields.volume import composite
 
 from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
 from .stability_rotations import Make
+from .stability_splats import splats
 
 _HUGE = 2.0**126  # an infinite density, as a number that can be compared
 
@@ -223,4 +224,4 @@ def _visible() -> Stress:
 
 def stresses() -> list[Stress]:
     """Operations along rays."""
-    return [_composite(), _union(), _visible()]
+    return [_composite(), _union(), _visible(), *splats()]
