@@ -150,6 +150,11 @@ class RefineConfig:
     """Part of the run after which corrections begin."""
     rigid: float = 0.4
     """Part of the run without residuals, which would otherwise explain wrong poses."""
+    drift: float = 0.0
+    """Slowness of the errors of the tracker: standard deviation of the Gaussian that smooths them
+    in time, seconds (of frames at 25 Hz where the capture has no rate); 0: frames are independent."""
+    jitter: float = 0.25
+    """Share of the variance of these errors that is independent between frames."""
     lr: float = 2e-3
     """Learning rate of rotations, radians; translations take 0.3 of it in metres."""
     prior: float = 5e-6
