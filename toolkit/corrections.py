@@ -29,7 +29,9 @@ def frame_times(frames: Sequence[int], fps: float | None) -> Float[Tensor, "f"]:
     return torch.tensor(frames, dtype=torch.float64) / (fps or RATE)
 
 
-def error_covariance(times: Float[Tensor, "f"], drift: float, jitter: float) -> Float[Tensor, "f f"]:
+def error_covariance(
+    times: Float[Tensor, "f"], drift: float, jitter: float
+) -> Float[Tensor, "f f"]:
     """Covariance in time of a tracker's errors of variance 1: a slow drift and independent noise.
 
     The drift is white noise smoothed by a Gaussian, so k(t, t') = (1 - jitter) exp(-(t - t')² /
@@ -179,7 +181,10 @@ class PoseCorrections(torch.nn.Module):
         Args:
             frames: number of each frame, ascending.
         """
-        values, number = self._mixed(self._values()), torch.tensor(frames, device=self.translations.device)
+        values, number = (
+            self._mixed(self._values()),
+            torch.tensor(frames, device=self.translations.device),
+        )
         gap = number.diff()
         even = torch.nonzero(gap[1:] == gap[:-1]).squeeze(-1)
         if not len(even):
