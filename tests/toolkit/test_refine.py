@@ -17,9 +17,7 @@ from monopart.toolkit.avatar import Avatar, view_of
 from monopart.toolkit.captures import read_capture
 from monopart.toolkit.captures.patches import PixelSampler
 from monopart.toolkit.cli import main
-from monopart.toolkit.corrections import (
-    error_covariance,
-)
+from monopart.toolkit.corrections import error_covariance, frame_times
 from monopart.toolkit.pose_errors import joint_error_table, joint_errors
 from monopart.toolkit.presets import preset, with_overrides
 from monopart.toolkit.refine import as_given, with_corrections, with_poses
