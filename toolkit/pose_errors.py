@@ -68,8 +68,12 @@ def joint_errors(avatar: Avatar, truth: CaptureRecord) -> tuple[JointError, Join
         seen = off @ camera.R.to(off).mT
         constant = (off @ axes).mean(0)  # in the axes of the body
         squares = seen.square().mean((0, 1))
-        parts = off.norm(dim=-1).mean(), squares[:2].sum().sqrt(), squares[2].sqrt()
-        return JointError(*(float(part) for part in parts), float(constant.norm(dim=-1).mean()))
+        return JointError(
+            mean=float(off.norm(dim=-1).mean()),
+            across=float(squares[:2].sum().sqrt()),
+            depth=float(squares[2].sqrt()),
+            constant=float(constant.norm(dim=-1).mean()),
+        )
 
     return error(avatar.given or avatar.record.poses), error(avatar.record.poses)
 

@@ -121,7 +121,7 @@ def test_a_step_moves_neighbours_as_far_as_they_share_the_drift() -> None:
         gradient = fix.translations.grad
         assert gradient is not None
         with torch.no_grad():
-            fix.translations += gradient  # one plain step
+            fix.translations.add_(gradient)  # one plain step
         every = BodyPose(*(v.expand(60, *v.shape[1:]) for v in vars(still).values()))
         return fix(every, torch.arange(60)).translation[:, 0].detach()
 
