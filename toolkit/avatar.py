@@ -14,6 +14,7 @@ from .cache import NO_CACHE, Cache
 from .capacity import allocated
 from .captures.records import CaptureRecord
 from .config import Config
+from .corrections import frame_times
 from .memory import PoseMemory
 from .model import AvatarModel
 from .prepared import distance_prior
@@ -54,6 +55,9 @@ class Avatar:
             prior = distance_prior(canonical.verts, record.body.faces, cache)
         model = AvatarModel(config, record.body, canonical, len(frames), prior)
         model.to(canonical.verts.device)  # initial values are drawn on the CPU: the same anywhere
+        if model.corrections is not None:
+            times, spec = frame_times(frames, record.fps), config.refine
+            model.corrections.couple(times, spec.drift, spec.jitter)
         table = model.parts if config.appearance.pose_feature else None
         memory = PoseMemory.build(frames, poses, table)
         return cls(record, config, canonical, memory, model, cache)

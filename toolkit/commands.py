@@ -25,10 +25,10 @@ from .config import Config
 from .device import pick_device
 from .explain import print_skipping, why_empty
 from .metrics import Protocol
+from .pose_errors import joint_error_table, joint_errors
 from .profile_page import print_profile, write_profile
 from .profiling import profile_training
 from .progress import counted, progress_bar
-from .refine import joint_error
 from .render import Picture, render_view, render_views
 from .results import (
     evaluate_splits,
@@ -262,8 +262,7 @@ def evaluate(
         evaluations = evaluate_splits(avatar, names, images, protocols)
     report_refit(run, avatar, evaluations, images is None and split is None)
     if truth is not None:
-        given, learned = joint_error(avatar, read_capture(avatar.record.root, params=truth))
-        print(f"joint error: as given {1e3 * given:.2f} mm | learned {1e3 * learned:.2f} mm")
+        print(joint_error_table(*joint_errors(avatar, read_capture(avatar.record.root, truth))))
     if training is not None:
         result, earlier = training
         size = min(STRIP_SIZE, *avatar.record.image_size)

@@ -153,11 +153,17 @@ class RefineConfig:
     """Part of the run after which corrections begin."""
     rigid: float = 0.4
     """Part of the run without residuals, which would otherwise explain wrong poses."""
-    lr: float = 2e-3
+    drift: float = 0.5
+    """Slowness of the errors of the tracker: standard deviation of the Gaussian that smooths them
+    in time, seconds (25 frames each where the capture has no rate); 0: frames are independent."""
+    jitter: float = 0.25
+    """Share of the variance of these errors that is independent between frames."""
+    lr: float = 1e-3
     """Learning rate of rotations, radians; translations take 0.3 of it in metres."""
-    prior: float = 5e-6
-    """Weight of the mean squared correction, in units of 0.03 rad, 0.01 m and 1 of shape."""
-    smooth: float = 1e-5
+    prior: float = 4e-5
+    """Weight of how unlikely the corrections are: their mean square with the drift undone, in units
+    of 0.03 rad, 0.01 m and 1 of shape."""
+    smooth: float = 0.0
     """Weight of the mean squared second difference of the corrections in time, same units."""
     opacity: float = 0.0
     """Weight of the squared difference of opacity and mask."""

@@ -9,12 +9,10 @@ from torch import Tensor
 
 from monopart.geometry.body import BodyPose
 from monopart.geometry.culling import BodyShell
-from monopart.geometry.errors import InputError
 from monopart.geometry.moving_parts import MovingParts
 from monopart.geometry.posed_parts import PosedParts
 
 from .avatar import Avatar
-from .captures.records import CaptureRecord
 from .config import RefineConfig
 from .corrections import PoseCorrections
 from .memory import PoseMemory
@@ -184,35 +182,3 @@ def as_given(avatar: Avatar) -> Avatar:
     if avatar.given is None:
         return avatar
     return with_poses(avatar, avatar.given)
-
-
-def joint_error(avatar: Avatar, truth: CaptureRecord) -> tuple[float, float]:
-    """Mean distance of the joints of the training frames to other poses of them, not aligned.
-
-    Args:
-        avatar: the trained person with its learned poses.
-        truth: the same capture with the other body track.
-
-    Returns:
-        Metres in the world: at the poses as given, and at the learned ones.
-
-    Raises:
-        InputError: the other track lacks a training frame or is of another body.
-    """
-    frames, body = avatar.memory.frames, avatar.record.body
-    lacking = [f for f in frames if f not in truth.poses]
-    if lacking or truth.body.num_joints != body.num_joints:
-        raise InputError(
-            f"{truth.params}: expected poses of {body.num_joints} joints in frame "
-            f"{(lacking or frames)[0]}, found none; name another track"
-        )
-
-    @torch.no_grad()
-    def joints(poses: dict[int, BodyPose]) -> Tensor:
-        posed = body(stack_poses([poses[f].to(body.v_template) for f in frames]))
-        return posed.to_world(posed.joints)
-
-    exact = joints(truth.poses)
-    tracks = avatar.given or avatar.record.poses, avatar.record.poses
-    before, after = (float((joints(t) - exact).norm(dim=-1).mean()) for t in tracks)
-    return before, after

@@ -18,7 +18,7 @@ from monopart.geometry.cameras import Rays
 from .avatar import Avatar
 from .captures.patches import PixelSampler
 from .captures.records import CaptureRecord
-from .corrections import PoseCorrections
+from .corrections import PoseCorrections, frame_times
 from .device import sent
 from .evaluate import Evaluation, evaluate_split
 from .losses import color_loss
@@ -98,13 +98,15 @@ def refit_poses(
         Pose by frame.
     """
     config, record = avatar.config, avatar.record
+    spec, times = config.refine, frame_times(frames, record.fps)
     fix = PoseCorrections(len(frames), record.body.num_joints).to(avatar.device)
+    fix.couple(times, spec.drift, spec.jitter)
     refined = RefinedPoses(avatar, frames, fix)
     sampler = _sampler(record, camera, frames, config.train.band)
     inputs = _inputs(avatar, frames)
-    optimizer = pose_optimizer(fix, config.refine)
+    optimizer = pose_optimizer(fix, spec)
     generator = torch.Generator().manual_seed(config.seed)
-    steps = config.refine.refit_steps
+    steps = spec.refit_steps
     learning = [p for p in avatar.model.parameters() if p.requires_grad]
     try:
         for parameter in learning:
