@@ -89,7 +89,7 @@ def _projection() -> Stress:
             ("flat", 2.0, flat, 0.2),
             ("points", 2.0, _NONE, 0.2),
         ),
-        *(("needles", 2.0, (1.0, 1e-6, 1e-6), 0.2), ("1e-12 m", 2.0, (1e-12,) * 3, 0.2)),
+        *(("needles", 2.0, (1.0, 1e-6, 1e-6), 0.2), ("1e-12 m", 2.0, (1e-12, 1e-12, 1e-12), 0.2)),
         *(("100 m", 2.0, (100.0, 50.0, 1.0), 0.2), ("2 cm away", 0.02, small, 0.2)),
         *(("10 km away", 1e4, small, 0.2), ("89° aside", 2.0, small, 50.0)),
     )
@@ -157,7 +157,10 @@ def _pictures() -> Stress:
         ),
         *(("opaque", _cloud(2.0, small, dense=1.0)), ("none seen", _cloud(2.0, small, dense=0.0))),
         *(("at the camera", _cloud(0.0, small)), ("behind it", _cloud(-2.0, small))),
-        *(("1 km away", _cloud(1e3, (10.0, 20.0, 40.0))), ("2 cm away", _cloud(0.02, (1e-3,) * 3))),
+        *(
+            ("1 km away", _cloud(1e3, (10.0, 20.0, 40.0))),
+            ("2 cm away", _cloud(0.02, (1e-3, 1e-3, 1e-3))),
+        ),
         ("one", lambda g, n: tuple(x[:1] for x in _cloud(2.0, small, 0.0, half)(g, n))),
         ("no Gaussians", lambda g, n: tuple(x[:0] for x in _cloud(2.0, small)(g, n))),
     )
