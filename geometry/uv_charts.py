@@ -11,7 +11,7 @@ from .uv_energy import ISOMETRIC, RestShape, face_energy
 from .uv_flatten import arap_map, flipped_charts, harmonic_map, lscm_map, slim_start
 from .uv_mesh import CutMesh
 from .uv_mirror import chart_mates, mirrored_edges
-from .uv_newton import NewtonSolver
+from .uv_newton import relaxed_charts
 from .uv_overlap import overlapping_pairs
 from .uv_seams import Surface, cut_to_discs
 from .uv_split import fiedler, split_paths
@@ -70,12 +70,14 @@ class Atlas:
         some = np.arange(len(self.cut.faces)) if faces is None else np.flatnonzero(faces)
         if len(some) == 0:
             return self
-        used, local = np.unique(self.cut.faces[some], return_inverse=True)
-        _, chart = np.unique(self.cut.chart[some], return_inverse=True)
-        rest = self.rest.of_faces(some)
-        solver = NewtonSolver(local.reshape(-1, 3), rest, chart, len(used))
-        uv = self.uv.copy()
-        uv[used] = solver.run(uv[used], steps, gain)
+        uv = relaxed_charts(
+            self.cut.faces[some],
+            self.rest.of_faces(some),
+            self.cut.chart[some],
+            self.uv,
+            steps,
+            gain,
+        )
         return Atlas(self.surface, self.rest, self.cut, uv)
 
     def overlaps(self) -> Int[np.ndarray, "n 2"]:
