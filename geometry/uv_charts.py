@@ -80,9 +80,13 @@ class Atlas:
         )
         return Atlas(self.surface, self.rest, self.cut, uv)
 
-    def overlaps(self) -> Int[np.ndarray, "n 2"]:
-        """Pairs of faces of one chart that lie on each other."""
-        return overlapping_pairs(_apart(self.corner_uv, self.cut.chart))
+    def overlaps(self, faces: Bool[np.ndarray, "F"] | None = None) -> Int[np.ndarray, "n 2"]:
+        """Pairs of faces (of some) of one chart that lie on each other."""
+        some = np.arange(len(self.cut.faces)) if faces is None else np.flatnonzero(faces)
+        if len(some) == 0:
+            return np.zeros((0, 2), np.int64)
+        _, chart = np.unique(self.cut.chart[some], return_inverse=True)
+        return some[overlapping_pairs(_apart(self.corner_uv[some], chart))]
 
 
 def _apart(corner: np.ndarray, chart: np.ndarray) -> np.ndarray:
@@ -108,7 +112,7 @@ def first_atlas(surface: Surface, seams: Bool[np.ndarray, "E"]) -> Atlas:
     Returns:
         The discs.
     """
-    rest = RestShape.of(surface.verts, surface.faces)
+    rest = surface.rest
     for _ in range(_ROUNDS):
         seams = cut_to_discs(surface, seams)
         cut = CutMesh.of(surface.edges, seams)
@@ -140,7 +144,7 @@ def shared_out(
     Returns:
         Edges to cut.
     """
-    area = RestShape.of(surface.verts, surface.faces).area
+    area = surface.rest.area
     for _ in range(_ROUNDS):
         seams = cut_to_discs(surface, seams)
         cut = CutMesh.of(surface.edges, seams)
@@ -175,7 +179,7 @@ def atlas_by_method(
     cut = CutMesh.of(surface.edges, cut_to_discs(surface, seams))
     maps = {"harmonic": harmonic_map, "lscm": lscm_map, "arap": arap_map}
     uv = maps[method](cut, surface.verts)
-    return Atlas(surface, RestShape.of(surface.verts, surface.faces), cut, uv)
+    return Atlas(surface, surface.rest, cut, uv)
 
 
 def halves(
@@ -192,7 +196,7 @@ def halves(
     Returns:
         Edge indices.
     """
-    field = fiedler(surface, cut, first_guess(surface)[cut.origin], weight)
+    field = fiedler(surface, cut, first_guess(surface)[cut.origin], weight, charts)
     return split_paths(surface, cut, field, weight, charts)
 
 

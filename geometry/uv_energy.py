@@ -52,7 +52,11 @@ class RestShape:
     @classmethod
     def of(cls, verts: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> "RestShape":
         """Rest shape of a mesh."""
-        flat = flat_triangles(verts, faces)
+        return cls.of_flat(flat_triangles(verts, faces))
+
+    @classmethod
+    def of_flat(cls, flat: Float[np.ndarray, "F 2 2"]) -> "RestShape":
+        """Rest shape of triangles that are laid into the plane."""
         a, x, y = flat[:, 0, 0], flat[:, 0, 1], flat[:, 1, 1]
         zero = np.zeros_like(a)
         inverse = np.stack([np.stack([1 / a, -x / (a * y)], -1), np.stack([zero, 1 / y], -1)], 1)

@@ -9,13 +9,15 @@ from jaxtyping import Int
 from .uv_charts import Atlas, first_guess, halves
 from .uv_energy import ISOMETRIC
 from .uv_mirror import chart_mates, mirrored_edges, symmetric_edges
-from .uv_split import fiedler, separators, split_paths, tip_slits
+from .uv_split import charts_after, fiedler, separators, split_paths, tip_slits
 
 _ROUNDS = 80
 _TRIAL_STEPS = 12
 _FINAL_STEPS = 40
 _CHART_PRICE = 0.15
 """What a chart costs, as a length of seam, in units of the square root of the area."""
+_FOLD_PRICE = 0.0
+"""What a chart that lies on itself costs, in charts."""
 _SEAM_PRICE = 0.05
 """What any seam costs, however short."""
 
@@ -165,6 +167,7 @@ def _moves_of(atlas: Atlas, units: list[tuple[int, ...]], edges: np.ndarray) -> 
     trial = trial.relaxed(_TRIAL_STEPS, active)
     corner, before, after = trial.corner_uv, atlas.face_excess, trial.face_excess
     scale = float(np.sqrt(atlas.rest.area.sum()))
+    folded = np.unique(trial.cut.chart[trial.overlaps(active)[:, 0]])
     # what was cut besides, to come to discs, belongs to the move: its coordinates need it
     fresh = np.flatnonzero(trial.cut.seams & ~cut.seams)
     owner = cut.chart[cut.edges.face_pairs[fresh, 0]]
@@ -172,7 +175,9 @@ def _moves_of(atlas: Atlas, units: list[tuple[int, ...]], edges: np.ndarray) -> 
     for unit in units:
         own = fresh[np.isin(owner, unit)]
         faces = np.flatnonzero(np.isin(cut.chart, unit))
-        new = len(np.unique(trial.cut.chart[faces])) - len(unit)
+        pieces = np.unique(trial.cut.chart[faces])
+        # a piece that lies on itself has to be cut later
+        new = len(pieces) - len(unit) + _FOLD_PRICE * np.isin(pieces, folded).sum()
         price = _SEAM_PRICE + float(surface.length[own].sum()) / scale + _CHART_PRICE * new
         gain = float(before[faces].sum() - after[faces].sum())
         moves.append(Move(own, faces, corner[faces], gain, price))
@@ -184,17 +189,28 @@ def _is_own_mate(atlas: Atlas, chart: int) -> bool:
 
 
 def _separated(atlas: Atlas, pairs: Int[np.ndarray, "n 2"]) -> Atlas:
-    """Every chart that lies on itself cut between the faces that meet."""
-    cut, surface = atlas.cut, atlas.surface
-    field = fiedler(surface, cut, first_guess(surface)[cut.origin], atlas.rest.area)
+    """Every chart that lies on itself cut in two, so that most of the faces that meet part."""
+    cut, surface, area = atlas.cut, atlas.surface, atlas.rest.area
     charts = np.unique(cut.chart[pairs[:, 0]])
-    field = separators(surface, cut, pairs, field)
     meets = np.bincount(pairs.reshape(-1), minlength=len(cut.chart)) > 0
-    edges = split_paths(surface, cut, field, atlas.rest.area * (meets + 0.01), charts)
-    edges = edges[~cut.seams[edges]]
-    chart = cut.chart[np.maximum(cut.edges.face_pairs[edges, 0], 0)]
-    missed = np.setdiff1d(charts, chart)
-    if len(missed):
-        edges = np.union1d(edges, halves(surface, cut, missed, atlas.rest.area))
+    start = first_guess(surface)[cut.origin]
+    slow = fiedler(surface, cut, start, area, charts)
+    folded = fiedler(surface, cut, start, area * (meets + 0.01), charts)
+    fields = [(separators(surface, cut, pairs, f), area * (meets + 0.01)) for f in (slow, folded)]
+    fields += [(slow, area), (folded, area * (meets + 0.01))]
+    left = np.full(cut.num_charts, len(pairs) + 1)
+    best: dict[int, np.ndarray] = {}
+    for field, weight in fields:
+        edges = split_paths(surface, cut, field, weight, charts)
+        edges = edges[~cut.seams[edges]]
+        owner = cut.chart[np.maximum(cut.edges.face_pairs[edges, 0], 0)]
+        after = charts_after(cut, edges)
+        joined = after[pairs[:, 0]] == after[pairs[:, 1]]
+        remain = np.bincount(cut.chart[pairs[joined, 0]], minlength=cut.num_charts)
+        for chart in np.intersect1d(charts, owner).tolist():
+            if remain[chart] < left[chart]:
+                left[chart], best[chart] = remain[chart], edges[owner == chart]
+    if not best:
+        return atlas.opened(atlas.cut.edges.of_face[pairs[:, 0]].reshape(-1))
     active = np.isin(cut.chart, charts)
-    return atlas.opened(edges).relaxed(_TRIAL_STEPS, active)
+    return atlas.opened(np.concatenate(list(best.values()))).relaxed(_TRIAL_STEPS, active)

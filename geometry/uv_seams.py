@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .uv_energy import RestShape, flat_triangles
 from .uv_mesh import CutMesh, MeshEdges
 
 _VIEWS = 48
@@ -29,6 +30,16 @@ class Surface:
     def faces(self) -> Int[np.ndarray, "F 3"]:
         """Vertex indices."""
         return self.edges.faces
+
+    @cached_property
+    def flat(self) -> Float[np.ndarray, "F 2 2"]:
+        """Every triangle laid into the plane."""
+        return flat_triangles(self.verts, self.faces)
+
+    @cached_property
+    def rest(self) -> RestShape:
+        """Rest shape of the triangles."""
+        return RestShape.of_flat(self.flat)
 
     @cached_property
     def length(self) -> Float[np.ndarray, "E"]:
