@@ -145,7 +145,7 @@ def _checked(options: UnwrapOptions) -> Any:
         )
     chosen["margin"] = float(chosen["margin"])
     if chosen["chart_share"] is None:
-        chosen["chart_share"] = min(1.0, 2.0 * (chosen["target"] - 4))
+        chosen["chart_share"] = min(1.0, 0.15 * ((chosen["target"] - 4) / 0.03) ** 0.5)
     elif not 0 < chosen["chart_share"] <= 1:
         raise InputError(f"chart_share: expected a number in (0, 1], found {chosen['chart_share']}")
     return chosen

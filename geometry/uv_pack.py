@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from .errors import InputError
 
 _TURNS = 12
-_COARSE, _FINE = 64, 384
+_COARSE, _FINE = 96, 384
 _TRIALS = 18
 _WORKERS = 2
 _FREE, _MANY = 60, 150

@@ -9,16 +9,18 @@ from jaxtyping import Int
 from .uv_charts import Atlas, first_guess, halves
 from .uv_energy import ISOMETRIC
 from .uv_mirror import chart_mates, mirrored_edges, symmetric_edges
-from .uv_split import charts_after, fiedler, separators, split_paths, tip_slits
+from .uv_split import charts_after, fiedler, separators, sign_changes, split_paths, tip_slits
 
 _ROUNDS = 80
 _TRIAL_STEPS = 12
 _FINAL_STEPS = 40
+_NEAR = 1.5
+"""Excess, in that of the target, below which the charts are relaxed before more are cut."""
 _CHART_PRICE = 0.15
 """What a chart costs, as a length of seam, in units of the square root of the area."""
 _FOLD_PRICE = 0.0
 """What a chart that lies on itself costs, in charts."""
-_SEAM_PRICE = 0.05
+_SEAM_PRICE = 0.1
 """What any seam costs, however short."""
 
 Progress = Callable[[str, float], None]
@@ -65,8 +67,14 @@ def _towards(
     atlas: Atlas, target: float, max_charts: int | None, progress: Progress | None
 ) -> Atlas:
     known: dict[tuple[int, ...], Move] = {}
+    near = False
     for _ in range(_ROUNDS):
         energy = atlas.mean_energy
+        if not near and energy - ISOMETRIC < _NEAR * (target - ISOMETRIC):
+            # what the trials left undone is a part of the excess by now
+            atlas, near = atlas.relaxed(_FINAL_STEPS), True
+            energy = atlas.mean_energy
+            known.clear()
         if progress is not None:
             progress("charts", min(0.99, (target - 4) / max(energy - 4, 1e-9)))
         full = max_charts is not None and atlas.cut.num_charts >= max_charts
@@ -198,19 +206,25 @@ def _separated(atlas: Atlas, pairs: Int[np.ndarray, "n 2"]) -> Atlas:
     folded = fiedler(surface, cut, start, area * (meets + 0.01), charts)
     fields = [(separators(surface, cut, pairs, f), area * (meets + 0.01)) for f in (slow, folded)]
     fields += [(slow, area), (folded, area * (meets + 0.01))]
-    left = np.full(cut.num_charts, len(pairs) + 1)
-    best: dict[int, np.ndarray] = {}
-    for field, weight in fields:
-        edges = split_paths(surface, cut, field, weight, charts)
+    before = np.bincount(cut.chart[pairs[:, 0]], minlength=cut.num_charts)
+    left, best = np.full(len(before), np.inf), dict[int, np.ndarray]()
+    stays = before.copy()
+    options = [split_paths(surface, cut, field, weight, charts) for field, weight in fields]
+    for number, edges in enumerate([*options, sign_changes(cut, fields[0][0])]):
         edges = edges[~cut.seams[edges]]
         owner = cut.chart[np.maximum(cut.edges.face_pairs[edges, 0], 0)]
         after = charts_after(cut, edges)
         joined = after[pairs[:, 0]] == after[pairs[:, 1]]
         remain = np.bincount(cut.chart[pairs[joined, 0]], minlength=cut.num_charts)
+        length = np.bincount(owner, surface.length[edges], minlength=cut.num_charts)
         for chart in np.intersect1d(charts, owner).tolist():
-            if remain[chart] < left[chart]:
-                left[chart], best[chart] = remain[chart], edges[owner == chart]
+            # cutting along every line makes many charts: only where no single one helps
+            helps = number < len(fields) or stays[chart] > before[chart] / 2
+            price = (remain[chart] + 0.05 * before[chart]) * length[chart]
+            if helps and price < left[chart]:
+                left[chart], stays[chart] = price, remain[chart]
+                best[chart] = edges[owner == chart]
     if not best:
-        return atlas.opened(atlas.cut.edges.of_face[pairs[:, 0]].reshape(-1))
+        return atlas.opened(cut.edges.of_face[pairs[:, 0]].reshape(-1))
     active = np.isin(cut.chart, charts)
     return atlas.opened(np.concatenate(list(best.values()))).relaxed(_TRIAL_STEPS, active)

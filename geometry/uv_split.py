@@ -144,6 +144,12 @@ def split_paths(
         Edge indices; a chart without an inner edge gets none.
     """
     lines = [line for line in _zero_lines(cut, field, weight, charts) if line is not None]
+    edges = _paths(surface, cut, field, [line for line in lines if line.ends is not None])
+    return _mended(cut, edges, lines, weight)
+
+
+def _paths(surface: Surface, cut: CutMesh, field: np.ndarray, lines: "list[_Line]") -> np.ndarray:
+    """Edges of the cheapest paths between the border near both ends of each line."""
     if not lines:
         return np.zeros(0, np.int64)
     follow = np.full(len(cut.origin), -1, np.int64)
@@ -153,9 +159,8 @@ def split_paths(
     size = np.bincount(cut.vert_chart[cut.border[:, 0]], minlength=cut.num_charts)
     starts, stops = [], []
     for line in lines:
-        reach = max(1, int(size[cut.vert_chart[line.first]]) // 40)
-        near_first = _along(follow, back, line.first, reach)
-        near_last = _along(follow, back, line.last, reach)
+        reach = max(1, int(size[line.chart]) // 40)
+        near_first, near_last = (_along(follow, back, end, reach) for end in line.ends or ())
         near_last = near_last[~np.isin(near_last, near_first)]
         starts.append(np.setdiff1d(near_first, near_last))
         stops.append(near_last)
@@ -163,8 +168,7 @@ def split_paths(
     distance, before = _shortest(_across(surface, cut, field, begin), begin)
     best = [e[int(np.argmin(distance[e]))] for e in stops if len(e)]
     reached = np.array([v for v in best if np.isfinite(distance[v])], np.int64)
-    edges = path_edges(surface, cut, before, reached)
-    return _mended(cut, edges, lines, weight)
+    return path_edges(surface, cut, before, reached)
 
 
 def _mended(
@@ -181,10 +185,26 @@ def _mended(
     np.maximum.at(largest, of_piece, mass)
     out = []
     for line in lines:
-        chart = int(cut.vert_chart[line.first])
-        good = whole[chart] - largest[chart] >= 0.5 * line.balance
-        out.append(edges[owner == chart] if good else line.edges)
-    return np.concatenate(out)
+        lighter = whole[line.chart] - largest[line.chart]
+        good = line.ends is not None and lighter >= 0.5 * line.balance
+        out.append(edges[owner == line.chart] if good else line.edges)
+    return np.concatenate([np.zeros(0, np.int64), *out])
+
+
+def sign_changes(cut: CutMesh, field: Float[np.ndarray, "W"]) -> Int[np.ndarray, "n"]:
+    """Uncut edges between faces above zero and faces below it.
+
+    Args:
+        cut: the cut mesh.
+        field: values at its vertices.
+
+    Returns:
+        Edge indices.
+    """
+    above = field[cut.faces].mean(1) > 0
+    uncut = np.flatnonzero(~cut.seams)
+    pairs = cut.edges.face_pairs[uncut]
+    return uncut[above[pairs[:, 0]] != above[pairs[:, 1]]]
 
 
 def charts_after(cut: CutMesh, edges: Int[np.ndarray, "n"]) -> Int[np.ndarray, "F"]:
@@ -207,9 +227,9 @@ def charts_after(cut: CutMesh, edges: Int[np.ndarray, "n"]) -> Int[np.ndarray, "
 class _Line:
     """Edges between faces above and below zero that part a disc in two."""
 
-    first: int
-    last: int
-    """The two border vertices at its ends."""
+    chart: int
+    ends: tuple[int, int] | None
+    """The two border vertices at its ends; none where it touches the border oftener."""
     edges: np.ndarray
     balance: float
     """Weight on its lighter side."""
@@ -240,12 +260,12 @@ def _zero_lines(
     out: list[_Line | None] = []
     for number in charts:
         some = slice(*np.searchsorted(chart, [number, number + 1]))
-        out.append(_best_line(cut, line_edges[some], line_pairs[some], mass))
+        out.append(_best_line(cut, int(number), line_edges[some], line_pairs[some], mass))
     return out
 
 
 def _best_line(
-    cut: CutMesh, edges: np.ndarray, pairs: np.ndarray, mass: np.ndarray
+    cut: CutMesh, chart: int, edges: np.ndarray, pairs: np.ndarray, mass: np.ndarray
 ) -> _Line | None:
     if len(edges) == 0:
         return None
@@ -256,14 +276,16 @@ def _best_line(
     half = cut.edges.sides[edges, 0]
     a = cut.faces.reshape(-1)[half]
     b = cut.faces.reshape(-1)[half - half % 3 + (half + 1) % 3]
-    for line in np.argsort(-balance, kind="stable"):
+    order = np.argsort(-balance, kind="stable")
+    top = float(balance[order[0]])
+    for line in order[balance[order] >= 0.5 * top]:
         own = np.concatenate([a[which == line], b[which == line]])
         verts, degree = np.unique(own, return_counts=True)
         ends = verts[(degree == 1) & (cut.loop[verts] >= 0)]
         if len(ends) == 2:
             some = edges[which == line]
-            return _Line(int(ends[0]), int(ends[1]), some, float(balance[line]))
-    return None
+            return _Line(chart, (int(ends[0]), int(ends[1])), some, float(balance[line]))
+    return _Line(chart, None, edges[which == order[0]] if top > 0 else edges, top)
 
 
 def _balance(tree: np.ndarray, mass: np.ndarray) -> np.ndarray:
