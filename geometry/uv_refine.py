@@ -12,8 +12,10 @@ from .uv_mirror import chart_mates, mirrored_edges, symmetric_edges
 from .uv_split import charts_after, fiedler, separators, sign_changes, split_paths, tip_slits
 
 _ROUNDS = 80
-_TRIAL_STEPS = 12
-_FINAL_STEPS = 40
+_TRIAL_STEPS = (5, 12)
+_FINAL_STEPS = (15, 40)
+"""Fewest and most Newton steps; the most up to `_LARGE` faces, fewer in proportion above."""
+_LARGE = 50_000
 _NEAR = 1.5
 """Excess, in that of the target, below which the charts are relaxed before more are cut."""
 _CHART_PRICE = 0.15
@@ -53,7 +55,7 @@ def refined(
     Returns:
         Discs of at most the target energy, none of which lies on itself.
     """
-    atlas = atlas.relaxed(_FINAL_STEPS)
+    atlas = atlas.relaxed(_steps(_FINAL_STEPS, atlas))
     atlas = _towards(atlas, target, max_charts, progress)
     for _ in range(_ROUNDS):
         pairs = atlas.overlaps()
@@ -61,6 +63,11 @@ def refined(
             break
         atlas = _separated(atlas, pairs)
     return atlas
+
+
+def _steps(bounds: tuple[int, int], atlas: Atlas) -> int:
+    least, most = bounds
+    return max(least, min(most, most * _LARGE // max(len(atlas.cut.faces), 1)))
 
 
 def _towards(
@@ -72,7 +79,7 @@ def _towards(
         energy = atlas.mean_energy
         if not near and energy - ISOMETRIC < _NEAR * (target - ISOMETRIC):
             # what the trials left undone is a part of the excess by now
-            atlas, near = atlas.relaxed(_FINAL_STEPS), True
+            atlas, near = atlas.relaxed(_steps(_FINAL_STEPS, atlas)), True
             energy = atlas.mean_energy
             known.clear()
         if progress is not None:
@@ -90,7 +97,7 @@ def _towards(
         seams = np.concatenate([move.edges for move in chosen])
         opened = atlas.opened(seams)
         atlas = opened.carried(opened.cut, corner)
-    return atlas.relaxed(_FINAL_STEPS, gain=1e-4)
+    return atlas.relaxed(_steps(_FINAL_STEPS, atlas), gain=1e-4)
 
 
 def _best(moves: list[Move], atlas: Atlas, target: float) -> list[Move]:
@@ -172,7 +179,7 @@ def _moves_of(atlas: Atlas, units: list[tuple[int, ...]], edges: np.ndarray) -> 
         groups.append(own[~cut.seams[own]])
     trial = atlas.opened(np.concatenate(groups))
     active = np.isin(cut.chart, np.concatenate(units))
-    trial = trial.relaxed(_TRIAL_STEPS, active)
+    trial = trial.relaxed(_steps(_TRIAL_STEPS, atlas), active)
     corner, before, after = trial.corner_uv, atlas.face_excess, trial.face_excess
     scale = float(np.sqrt(atlas.rest.area.sum()))
     folded = np.unique(trial.cut.chart[trial.overlaps(active)[:, 0]])
@@ -227,4 +234,4 @@ def _separated(atlas: Atlas, pairs: Int[np.ndarray, "n 2"]) -> Atlas:
     if not best:
         return atlas.opened(cut.edges.of_face[pairs[:, 0]].reshape(-1))
     active = np.isin(cut.chart, charts)
-    return atlas.opened(np.concatenate(list(best.values()))).relaxed(_TRIAL_STEPS, active)
+    return atlas.opened(np.concatenate(list(best.values()))).relaxed(_steps(_TRIAL_STEPS, atlas), active)
