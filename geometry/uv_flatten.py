@@ -108,9 +108,9 @@ def harmonic_map(
     inside = np.flatnonzero(cut.loop < 0)
     if len(inside) == 0:
         return uv
-    matrix = laplacian(
-        cut.faces, len(uv), flat_triangles(verts, cut.edges.faces), kind
-    ).tocsr()[inside]
+    matrix = laplacian(cut.faces, len(uv), flat_triangles(verts, cut.edges.faces), kind).tocsr()[
+        inside
+    ]
     ring = np.flatnonzero(cut.loop >= 0)
     right = -(matrix[:, ring] @ uv[ring])
     inner = matrix[:, inside].tocsc()

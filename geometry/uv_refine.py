@@ -213,25 +213,36 @@ def _separated(atlas: Atlas, pairs: Int[np.ndarray, "n 2"]) -> Atlas:
     folded = fiedler(surface, cut, start, area * (meets + 0.01), charts)
     fields = [(separators(surface, cut, pairs, f), area * (meets + 0.01)) for f in (slow, folded)]
     fields += [(slow, area), (folded, area * (meets + 0.01))]
-    before = np.bincount(cut.chart[pairs[:, 0]], minlength=cut.num_charts)
-    left, best = np.full(len(before), np.inf), dict[int, np.ndarray]()
-    stays = before.copy()
     options = [split_paths(surface, cut, field, weight, charts) for field, weight in fields]
-    for number, edges in enumerate([*options, sign_changes(cut, fields[0][0])]):
-        edges = edges[~cut.seams[edges]]
+    options.append(sign_changes(cut, fields[0][0]))
+    edges = _parting(atlas, pairs, options)
+    if len(edges) == 0:
+        return atlas.opened(cut.edges.of_face[pairs[:, 0]].reshape(-1))
+    active = np.isin(cut.chart, charts)
+    return atlas.opened(edges).relaxed(_steps(_TRIAL_STEPS, atlas), active)
+
+
+def _parting(atlas: Atlas, pairs: np.ndarray, options: list[np.ndarray]) -> np.ndarray:
+    """Of ways to cut the charts, for each the one that parts most pairs for its length.
+
+    The last way, along every line, makes many charts: it is for those that no other helps.
+    """
+    cut = atlas.cut
+    before = np.bincount(cut.chart[pairs[:, 0]], minlength=cut.num_charts)
+    stays, least = before.copy(), np.full(cut.num_charts, np.inf)
+    best: dict[int, np.ndarray] = {}
+    for number, option in enumerate(options):
+        edges = option[~cut.seams[option]]
         owner = cut.chart[np.maximum(cut.edges.face_pairs[edges, 0], 0)]
         after = charts_after(cut, edges)
         joined = after[pairs[:, 0]] == after[pairs[:, 1]]
         remain = np.bincount(cut.chart[pairs[joined, 0]], minlength=cut.num_charts)
-        length = np.bincount(owner, surface.length[edges], minlength=cut.num_charts)
-        for chart in np.intersect1d(charts, owner).tolist():
-            # cutting along every line makes many charts: only where no single one helps
-            helps = number < len(fields) or stays[chart] > before[chart] / 2
-            price = (remain[chart] + 0.05 * before[chart]) * length[chart]
-            if helps and price < left[chart]:
-                left[chart], stays[chart] = price, remain[chart]
-                best[chart] = edges[owner == chart]
-    if not best:
-        return atlas.opened(cut.edges.of_face[pairs[:, 0]].reshape(-1))
-    active = np.isin(cut.chart, charts)
-    return atlas.opened(np.concatenate(list(best.values()))).relaxed(_steps(_TRIAL_STEPS, atlas), active)
+        length = np.bincount(owner, atlas.surface.length[edges], minlength=cut.num_charts)
+        price = (remain + 0.05 * before) * length
+        better = (before > 0) & (np.bincount(owner, minlength=cut.num_charts) > 0) & (price < least)
+        if number == len(options) - 1:
+            better &= 2 * stays > before
+        for chart in np.flatnonzero(better).tolist():
+            best[chart] = edges[owner == chart]
+        stays[better], least[better] = remain[better], price[better]
+    return np.concatenate([np.zeros(0, np.int64), *best.values()])
