@@ -278,14 +278,32 @@ def _best_line(
     b = cut.faces.reshape(-1)[half - half % 3 + (half + 1) % 3]
     order = np.argsort(-balance, kind="stable")
     top = float(balance[order[0]])
-    for line in order[balance[order] >= 0.5 * top]:
+    for line in order[balance[order] >= max(0.5 * top, 1e-300)]:
         own = np.concatenate([a[which == line], b[which == line]])
         verts, degree = np.unique(own, return_counts=True)
         ends = verts[(degree == 1) & (cut.loop[verts] >= 0)]
         if len(ends) == 2:
             some = edges[which == line]
             return _Line(chart, (int(ends[0]), int(ends[1])), some, float(balance[line]))
-    return _Line(chart, None, edges[which == order[0]] if top > 0 else edges, top)
+    if top > 0:
+        return _Line(chart, None, edges[which == order[0]], top)
+    nodes, local = np.unique(pairs, return_inverse=True)
+    return _around(chart, edges, local.reshape(-1, 2), mass[nodes])
+
+
+def _around(chart: int, edges: np.ndarray, pairs: np.ndarray, mass: np.ndarray) -> _Line:
+    """The line around the heaviest of what is left of a disc without its heaviest island.
+
+    Both sides are whole, so a field that is mere noise makes two charts of one, not hundreds.
+    """
+    core = int(mass.argmax())
+    free = (pairs != core).all(1)
+    group = components(len(mass), pairs[free, 0], pairs[free, 1])
+    weight = np.bincount(group, mass)
+    weight[group[core]] = -1.0
+    inside = group == int(weight.argmax())
+    balance = min(float(mass[inside].sum()), float(mass[~inside].sum()))
+    return _Line(chart, None, edges[inside[pairs[:, 0]] != inside[pairs[:, 1]]], balance)
 
 
 def _balance(tree: np.ndarray, mass: np.ndarray) -> np.ndarray:
