@@ -28,6 +28,7 @@ from monopart.tools.bench.show import cells, markdown
 from monopart.tools.bench.skinning_methods import plain_arrays, plain_skinning
 from monopart.tools.bench.surface_methods import judge_surface
 from monopart.tools.bench.timing import Effort, measure, spread
+from monopart.tools.bench.unwrap_meshes import MESHES
 
 SPREAD = {"median", "min", "q1", "q3", "count"}
 ROW = {"method", "ours", "size", "setting", "wall", "cpu", "error", "facts"}
@@ -65,8 +66,17 @@ def _run(name: str, out: Path, *arguments: str) -> dict:
 
 
 @pytest.mark.slow
+def test_meshes_of_the_uv_suite() -> None:
+    assert {o.name for o in uv.operations()} == set(MESHES)
+    for name in ("ring", "two_rings", "holes", "part_3"):
+        data = MESHES[name][1]()
+        assert data.faces.max() == len(data.verts) - 1
+        assert len(data.parts) == len(data.faces) > 500
+
+
+@pytest.mark.slow
 def test_uv_suite(tmp_path: Path) -> None:
-    data = _run("uv", tmp_path)
+    data = _run("uv", tmp_path, "--only", "ring")
     rows = {row["method"]: row for row in data["tables"][0]["rows"]}
     assert {"monopart", "monopart, few charts", "xatlas", "LSCM (libigl) on cut parts"} <= set(rows)
     for row in rows.values():

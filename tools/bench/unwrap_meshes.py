@@ -1,7 +1,8 @@
 """Meshes on which unwrapping is compared: the body, its parts, finer and coarser ones, rings."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -34,14 +35,11 @@ def body_data() -> UnwrapData:
     )
 
 
-def part_data() -> dict[str, UnwrapData]:
-    """Each of the six parts of the default body as a mesh of its own, with holes."""
-    body, names = body_data(), PartMap.preset("six").names
-    out = {}
-    for part, name in enumerate(names):
-        used, faces = body.faces[body.parts == part].unique(return_inverse=True)
-        out[name] = UnwrapData(body.verts[used], faces, torch.zeros(len(faces)).long())
-    return out
+def part_data(part: int) -> UnwrapData:
+    """One of the six parts of the default body as a mesh of its own, with holes."""
+    body = body_data()
+    used, faces = body.faces[body.parts == part].unique(return_inverse=True)
+    return UnwrapData(body.verts[used], faces, torch.zeros(len(faces)).long())
 
 
 def thinned(data: UnwrapData, count: int) -> UnwrapData:
@@ -129,19 +127,13 @@ def with_holes() -> UnwrapData:
     return _plain(verts, faces[keep])
 
 
-def unwrap_meshes(quick: bool) -> Iterator[tuple[str, UnwrapData]]:
-    """The meshes by name.
-
-    Args:
-        quick: only a small ring.
-    """
-    if quick:
-        yield "ring", torus(8, 5)
-        return
-    yield "body", body_data()
-    yield from part_data().items()
-    yield "body of SMPL's size", smpl_like()
-    yield "ring", torus(60, 30)
-    yield "two rings in one", genus_two()
-    yield "sphere with holes", with_holes()
-    yield "body of 200 000 faces", large_body()
+MESHES: dict[str, tuple[str, Callable[[], UnwrapData]]] = {
+    "body": ("default body", body_data),
+    "ring": ("ring", lambda: torus(60, 30)),
+    "two_rings": ("two rings in one", genus_two),
+    "holes": ("sphere with three holes", with_holes),
+    "smpl_size": ("body of SMPL's size", smpl_like),
+    **{f"part_{i}": (f"part {i} of six alone", partial(part_data, i)) for i in range(6)},
+    "large": ("body of 200 000 faces", large_body),
+}
+"""By the name for the command line: what it is called, and how it is made."""
