@@ -19,6 +19,10 @@ GRID = 2.0**-24
 """Coordinates are whole multiples of this: exact in float32, so that tests of them are exact."""
 
 
+_SIMPLE = 16 * np.pi
+"""Total curvature up to which a mesh is a simple shape: four times that of a sphere."""
+
+
 class UnwrapOptions(TypedDict, total=False):
     """Keyword arguments of `unwrap`."""
 
@@ -37,7 +41,8 @@ class UnwrapOptions(TypedDict, total=False):
     max_charts: int | None
     """Make no more charts than this for the sake of the target; no limit."""
     chart_share: float | None
-    """Largest part of the surface in one chart: small charts pack tighter. None: by the target."""
+    """Largest part of the surface in one chart: small charts pack tighter. None: by the target,
+    for a simple shape a half."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,9 +149,8 @@ def _checked(options: UnwrapOptions) -> Any:
             f"{chosen['size']} and {chosen['margin']}; enlarge the texture"
         )
     chosen["margin"] = float(chosen["margin"])
-    if chosen["chart_share"] is None:
-        chosen["chart_share"] = min(1.0, 0.06 * ((chosen["target"] - 4) / 0.03) ** 0.75)
-    elif not 0 < chosen["chart_share"] <= 1:
+    share = chosen["chart_share"]
+    if share is not None and not 0 < share <= 1:
         raise InputError(f"chart_share: expected a number in (0, 1], found {chosen['chart_share']}")
     return chosen
 
@@ -199,7 +203,12 @@ def _layout(
     places = (verts - corners.mean((0, 1))) / np.sqrt(area)
     tell("seams", 0.0)
     surface = Surface.of(places, faces, chosen["symmetric"])
-    seams = shared_out(surface, surface.edges.seams_of_labels(labels), chosen["chart_share"])
+    share = chosen["chart_share"]
+    if share is None:
+        # a simple shape needs few charts: small ones would only add seams
+        simple = surface.curvature <= _SIMPLE
+        share = 0.5 if simple else min(1.0, 0.15 * ((chosen["target"] - 4) / 0.03) ** 0.5)
+    seams = shared_out(surface, surface.edges.seams_of_labels(labels), share)
     tell("flatten", 0.0)
     if chosen["method"] == "slim":
         atlas = refined(first_atlas(surface, seams), chosen["target"], chosen["max_charts"], tell)

@@ -11,7 +11,7 @@ from .uv_energy import ISOMETRIC, RestShape, face_energy
 from .uv_flatten import arap_map, flipped_charts, harmonic_map, lscm_map, slim_start
 from .uv_mesh import CutMesh
 from .uv_mirror import chart_mates, mirrored_edges
-from .uv_newton import NewtonSolver
+from .uv_newton import relaxed_charts
 from .uv_overlap import overlapping_pairs
 from .uv_seams import Surface, cut_to_discs
 from .uv_split import fiedler, split_paths
@@ -70,17 +70,23 @@ class Atlas:
         some = np.arange(len(self.cut.faces)) if faces is None else np.flatnonzero(faces)
         if len(some) == 0:
             return self
-        used, local = np.unique(self.cut.faces[some], return_inverse=True)
-        _, chart = np.unique(self.cut.chart[some], return_inverse=True)
-        rest = self.rest.of_faces(some)
-        solver = NewtonSolver(local.reshape(-1, 3), rest, chart, len(used))
-        uv = self.uv.copy()
-        uv[used] = solver.run(uv[used], steps, gain)
+        uv = relaxed_charts(
+            self.cut.faces[some],
+            self.rest.of_faces(some),
+            self.cut.chart[some],
+            self.uv,
+            steps,
+            gain,
+        )
         return Atlas(self.surface, self.rest, self.cut, uv)
 
-    def overlaps(self) -> Int[np.ndarray, "n 2"]:
-        """Pairs of faces of one chart that lie on each other."""
-        return overlapping_pairs(_apart(self.corner_uv, self.cut.chart))
+    def overlaps(self, faces: Bool[np.ndarray, "F"] | None = None) -> Int[np.ndarray, "n 2"]:
+        """Pairs of faces (of some) of one chart that lie on each other."""
+        some = np.arange(len(self.cut.faces)) if faces is None else np.flatnonzero(faces)
+        if len(some) == 0:
+            return np.zeros((0, 2), np.int64)
+        _, chart = np.unique(self.cut.chart[some], return_inverse=True)
+        return some[overlapping_pairs(_apart(self.corner_uv[some], chart))]
 
 
 def _apart(corner: np.ndarray, chart: np.ndarray) -> np.ndarray:
@@ -106,7 +112,7 @@ def first_atlas(surface: Surface, seams: Bool[np.ndarray, "E"]) -> Atlas:
     Returns:
         The discs.
     """
-    rest = RestShape.of(surface.verts, surface.faces)
+    rest = surface.rest
     for _ in range(_ROUNDS):
         seams = cut_to_discs(surface, seams)
         cut = CutMesh.of(surface.edges, seams)
@@ -138,7 +144,7 @@ def shared_out(
     Returns:
         Edges to cut.
     """
-    area = RestShape.of(surface.verts, surface.faces).area
+    area = surface.rest.area
     for _ in range(_ROUNDS):
         seams = cut_to_discs(surface, seams)
         cut = CutMesh.of(surface.edges, seams)
@@ -173,7 +179,7 @@ def atlas_by_method(
     cut = CutMesh.of(surface.edges, cut_to_discs(surface, seams))
     maps = {"harmonic": harmonic_map, "lscm": lscm_map, "arap": arap_map}
     uv = maps[method](cut, surface.verts)
-    return Atlas(surface, RestShape.of(surface.verts, surface.faces), cut, uv)
+    return Atlas(surface, surface.rest, cut, uv)
 
 
 def halves(
@@ -190,7 +196,7 @@ def halves(
     Returns:
         Edge indices.
     """
-    field = fiedler(surface, cut, first_guess(surface)[cut.origin], weight)
+    field = fiedler(surface, cut, first_guess(surface)[cut.origin], weight, charts)
     return split_paths(surface, cut, field, weight, charts)
 
 

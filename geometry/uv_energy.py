@@ -52,7 +52,11 @@ class RestShape:
     @classmethod
     def of(cls, verts: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> "RestShape":
         """Rest shape of a mesh."""
-        flat = flat_triangles(verts, faces)
+        return cls.of_flat(flat_triangles(verts, faces))
+
+    @classmethod
+    def of_flat(cls, flat: Float[np.ndarray, "F 2 2"]) -> "RestShape":
+        """Rest shape of triangles that are laid into the plane."""
         a, x, y = flat[:, 0, 0], flat[:, 0, 1], flat[:, 1, 1]
         zero = np.zeros_like(a)
         inverse = np.stack([np.stack([1 / a, -x / (a * y)], -1), np.stack([zero, 1 / y], -1)], 1)
@@ -120,37 +124,69 @@ def newton_terms(
     Reference:
         Smith, De Goes and Kim 2019, Analytic eigensystems for isotropic distortion energies.
     """
+    # two corners whose columns are the unit vectors: their coordinates are the entries of J
+    corners = np.tile(np.eye(2), (len(jacobian), 1, 1))
+    gradient, hessian = corner_terms(jacobian, corners)
+    gradient = np.ascontiguousarray(gradient.reshape(-1, 2, 2).transpose(0, 2, 1))
+    hessian = hessian.reshape(-1, 2, 2, 2, 2).transpose(0, 2, 1, 4, 3)
+    return gradient, hessian.reshape(-1, 4, 4)
+
+
+def corner_columns(inverse: Float[np.ndarray, "F 2 2"]) -> Float[np.ndarray, "F 3 2"]:
+    """What each corner of a triangle adds to its Jacobian: J = Σ uv_k ⊗ column_k.
+
+    Args:
+        inverse: see `RestShape`.
+
+    Returns:
+        The columns.
+    """
+    return np.stack([-inverse.sum(1), inverse[:, 0], inverse[:, 1]], 1)
+
+
+def corner_terms(
+    jacobian: Float[np.ndarray, "F 2 2"], columns: Float[np.ndarray, "F k 2"]
+) -> tuple[Float[np.ndarray, "F n"], Float[np.ndarray, "F n n"]]:
+    """Gradient and positive part of the Hessian with respect to the coordinates of the corners.
+
+    Args:
+        jacobian: derivatives of the maps, all of positive determinant.
+        columns: of `corner_columns`.
+
+    Returns:
+        Gradients and Hessians over u and v of the first corner, of the second and so on.
+
+    Reference:
+        Smith, De Goes and Kim 2019, Analytic eigensystems for isotropic distortion energies.
+    """
     a, b, c, d = jacobian.reshape(-1, 4).T
     # J = U diag(s1, s2) Vᵀ by the angles of its conformal and anticonformal part
     plus_angle, minus_angle = np.arctan2(c - b, a + d), np.arctan2(c + b, a - d)
     s1, s2 = singular_values(jacobian)
     left, right = (plus_angle + minus_angle) / 2, (minus_angle - plus_angle) / 2
-    u = _rotation(left)
-    v = _rotation(right)
+    cos_u, sin_u, cos_v, sin_v = np.cos(left), np.sin(left), np.cos(right), np.sin(right)
+    x, y = columns[..., 0].T, columns[..., 1].T  # (k, F)
+    # the columns in the frame of V, times the axes of U: derivatives of the entries of Uᵀ J V
+    along, across = cos_v * x + sin_v * y, cos_v * y - sin_v * x
+    stretch1 = np.stack([cos_u * along, sin_u * along], 1)
+    stretch2 = np.stack([-sin_u * across, cos_u * across], 1)
+    mixed1 = np.stack([cos_u * across, sin_u * across], 1)
+    mixed2 = np.stack([-sin_u * along, cos_u * along], 1)
     d1, d2 = 2 * s1 - 2 / s1**3, 2 * s2 - 2 / s2**3
     h11, h22 = 2 + 6 / s1**4, 2 + 6 / s2**4
     total, product = s1 + s2, s1 * s2
     # (d1 + d2) / (s1 + s2) and (d1 − d2) / (s1 − s2), without the division by a small number
-    twist = (d1 + d2) / total
-    flip = 2 + 2 * (s1 * s1 + product + s2 * s2) / product**3
-    gradient = np.einsum("fij,fj,fkj->fik", u, np.stack([d1, d2], -1), v)
-    basis = _basis(u, v)
-    values = np.stack([h11, h22, np.maximum(twist, 0.0), np.maximum(flip, 0.0)], -1)
-    return gradient, np.einsum("fki,fk,fkj->fij", basis, values, basis)
-
-
-def _rotation(angle: np.ndarray) -> np.ndarray:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
-
-
-def _basis(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Eigenmatrices of the Hessian as rows: two stretches, twist, flip; (F, 4, 4)."""
-    half = np.sqrt(0.5)
-    shapes = [
-        np.array([[1.0, 0.0], [0.0, 0.0]]),
-        np.array([[0.0, 0.0], [0.0, 1.0]]),
-        half * np.array([[0.0, -1.0], [1.0, 0.0]]),
-        half * np.array([[0.0, 1.0], [1.0, 0.0]]),
-    ]
-    return np.stack([(u @ s @ v.transpose(0, 2, 1)).reshape(-1, 4) for s in shapes], 1)
+    twist = np.maximum((d1 + d2) / total, 0.0) / 2
+    flip = 1 + (s1 * s1 + product + s2 * s2) / product**3
+    size = 2 * len(x)
+    gradient = (d1 * stretch1 + d2 * stretch2).reshape(size, -1)
+    shapes = np.stack(
+        [
+            np.sqrt(h11) * stretch1,
+            np.sqrt(h22) * stretch2,
+            np.sqrt(twist) * (mixed2 - mixed1),
+            np.sqrt(flip) * (mixed2 + mixed1),
+        ]
+    )
+    rows = np.ascontiguousarray(shapes.reshape(4, size, -1).transpose(2, 0, 1))
+    return np.ascontiguousarray(gradient.T), rows.transpose(0, 2, 1) @ rows

@@ -64,12 +64,15 @@ def corner_weights(flat: Float[np.ndarray, "F 2 2"], kind: str) -> Float[np.ndar
     return np.stack([here, there], -1)
 
 
-def laplacian(cut: CutMesh, flat: Float[np.ndarray, "F 2 2"], kind: str) -> Any:
-    """Sparse Laplacian over the vertices of a cut mesh; rows sum to zero.
+def laplacian(
+    faces: Int[np.ndarray, "F 3"], count: int, flat: Float[np.ndarray, "F 2 2"], kind: str
+) -> Any:
+    """Sparse Laplacian over the vertices of a mesh; rows sum to zero.
 
     Args:
-        cut: the cut mesh.
-        flat: its triangles laid into the plane.
+        faces: vertex indices.
+        count: number of vertices.
+        flat: the triangles laid into the plane.
         kind: of the weights.
 
     Returns:
@@ -78,10 +81,9 @@ def laplacian(cut: CutMesh, flat: Float[np.ndarray, "F 2 2"], kind: str) -> Any:
     from scipy.sparse import coo_matrix, diags
 
     weight = corner_weights(flat, kind)
-    start, end = cut.faces.reshape(-1), np.roll(cut.faces, -1, 1).reshape(-1)
+    start, end = faces.reshape(-1), np.roll(faces, -1, 1).reshape(-1)
     values = np.concatenate([weight[..., 0].reshape(-1), weight[..., 1].reshape(-1)])
     rows, cols = np.concatenate([start, end]), np.concatenate([end, start])
-    count = len(cut.origin)
     matrix = coo_matrix((values, (rows, cols)), (count, count)).tocsc()
     return diags(np.asarray(matrix.sum(1)).ravel()) - matrix
 
@@ -106,7 +108,9 @@ def harmonic_map(
     inside = np.flatnonzero(cut.loop < 0)
     if len(inside) == 0:
         return uv
-    matrix = laplacian(cut, flat_triangles(verts, cut.edges.faces), kind).tocsr()[inside]
+    matrix = laplacian(cut.faces, len(uv), flat_triangles(verts, cut.edges.faces), kind).tocsr()[
+        inside
+    ]
     ring = np.flatnonzero(cut.loop >= 0)
     right = -(matrix[:, ring] @ uv[ring])
     inner = matrix[:, inside].tocsc()
@@ -221,7 +225,7 @@ def arap_map(cut: CutMesh, verts: Float[np.ndarray, "V 3"]) -> Float[np.ndarray,
     rest = np.concatenate([np.zeros((len(flat), 1, 2)), flat.transpose(0, 2, 1)], 1)
     side = np.roll(rest, -1, 1) - rest
     weight = corner_weights(flat, "cotangent")[..., 0]
-    matrix = laplacian(cut, flat, "cotangent")
+    matrix = laplacian(cut.faces, len(cut.origin), flat, "cotangent")
     hold = 1e-8 * np.abs(matrix.diagonal()).mean()
     factors = factorised((matrix + diags(np.full(len(cut.origin), hold))).tocsc())
     uv = harmonic_map(cut, verts)

@@ -1,7 +1,7 @@
 """Seams of a symmetric mesh brought to its other side."""
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from .uv_mesh import CutMesh
 from .uv_seams import Surface, edge_index
@@ -100,3 +100,23 @@ def chart_mates(surface: Surface, cut: CutMesh) -> Int[np.ndarray, "C"]:
     good = (most > 0.7 * size) & (best[best] == np.arange(count))
     mates[good] = best[good]
     return mates
+
+
+def seam_symmetry(surface: Surface, seams: Bool[np.ndarray, "E"]) -> float:
+    """Share of the seams, by length, whose mirror image is a seam too.
+
+    Args:
+        surface: the mesh.
+        seams: mask of its edges.
+
+    Returns:
+        A share in [0, 1]; 1 without seams, NaN for a mesh without a mirror plane.
+    """
+    if surface.mirror is None:
+        return float("nan")
+    image = np.sort(surface.mirror[surface.edges.verts], 1)
+    base = len(surface.verts)
+    known = surface.edges.verts[:, 0] * base + surface.edges.verts[:, 1]
+    both = np.isin(image[:, 0] * base + image[:, 1], known[seams])
+    total = float(surface.length[seams].sum())
+    return float(surface.length[seams & both].sum()) / total if total > 0 else 1.0

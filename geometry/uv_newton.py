@@ -1,14 +1,19 @@
 """Locally injective minimisation of the symmetric Dirichlet energy, all charts in one system."""
 
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from .errors import InputError
-from .uv_energy import RestShape, face_energy, newton_terms
+from .uv_energy import RestShape, corner_columns, corner_terms, face_energy
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+_THREADS = 2
 _LARGEST_STEP = 0.9
 """Share of the way to the first triangle without area."""
 _TRIES = 12
@@ -18,7 +23,14 @@ _SYMMETRIC = {
     "permc_spec": "MMD_AT_PLUS_A",
     "diag_pivot_thresh": 0.0,
     "options": {"SymmetricMode": True, "Equil": False},
+    # small fronts waste least on the matrices of surfaces
+    "relax": 1,
+    "panel_size": 1,
 }
+_ORDERED = _SYMMETRIC | {"permc_spec": "NATURAL"}
+"""For a matrix whose unknowns come in a good order already."""
+_GROUP = 2500
+"""Faces that are solved together; groups go to threads, and each stops when it is done."""
 
 
 @dataclass(eq=False)
@@ -32,11 +44,13 @@ class NewtonSolver:
     num_verts: int
 
     def __post_init__(self) -> None:
-        """Lay out the sparse system."""
+        """Lay out the sparse system, its unknowns in an order that keeps the factors sparse."""
         self.num_charts = int(self.chart.max(initial=-1)) + 1
         self.vert_chart = np.zeros(self.num_verts, np.int64)
         self.vert_chart[self.faces.reshape(-1)] = np.repeat(self.chart, 3)
-        slots = np.stack([2 * self.faces, 2 * self.faces + 1], -1).reshape(len(self.faces), 6)
+        self._place = _sparse_order(self.faces, self.num_verts)
+        place = 2 * self._place[self.faces]
+        slots = np.stack([place, place + 1], -1).reshape(len(self.faces), 6)
         rows = np.repeat(slots, 6, axis=1).reshape(-1)
         cols = np.tile(slots, (1, 6)).reshape(-1)
         size = 2 * self.num_verts
@@ -44,7 +58,8 @@ class NewtonSolver:
         self._indices = (key % size).astype(np.int32)
         self._indptr = np.searchsorted(key // size, np.arange(size + 1)).astype(np.int32)
         self._diagonal = np.flatnonzero(key % size == key // size)
-        self._spread = _spread(self.rest)
+        self._unknown = slots.reshape(-1)
+        self._corners = corner_columns(self.rest.inverse)
         self._area = np.bincount(self.chart, self.rest.area, minlength=self.num_charts)
 
     def energies(self, uv: Float[np.ndarray, "W 2"]) -> Float[np.ndarray, "C"]:
@@ -53,14 +68,19 @@ class NewtonSolver:
         return np.bincount(self.chart, each, minlength=self.num_charts) / self._area
 
     def run(
-        self, uv: Float[np.ndarray, "W 2"], steps: int, gain: float = 1e-4
+        self,
+        uv: Float[np.ndarray, "W 2"],
+        steps: int,
+        gain: float = 1e-4,
+        enough: float = 0.0,
     ) -> Float[np.ndarray, "W 2"]:
-        """Take Newton steps until no chart gains any more.
+        """Take Newton steps until the charts gain no more.
 
         Args:
             uv: coordinates without a flipped face.
             steps: at most so many.
             gain: stop when the mean energy falls by less than this part of its excess over 4.
+            enough: an excess; that of the charts counts as no less for the rule above.
 
         Returns:
             Coordinates of lower energy, without a flipped face.
@@ -72,27 +92,25 @@ class NewtonSolver:
             fell = float(((before - after) * self._area).sum() / self._area.sum())
             rest = float(((after - 4) * self._area).sum() / self._area.sum())
             before = after
-            if fell <= gain * rest:
+            if fell <= gain * max(rest, enough):
                 break
         return uv
 
     def _direction(self, uv: np.ndarray) -> np.ndarray:
-        gradient, hessian = newton_terms(self.rest.jacobians(uv[self.faces]))
+        jacobian = self.rest.jacobians(uv[self.faces])
+        force, local = corner_terms(jacobian, self._corners)
         area = self.rest.area[:, None]
-        force = area * np.einsum("fij,fi->fj", self._spread, gradient.reshape(-1, 4))
-        local = np.einsum("fki,fkl,flj->fij", self._spread, hessian, self._spread, optimize=True)
         values = np.bincount(self._slot, (area[..., None] * local).reshape(-1))
         values[self._diagonal] += 1e-9 * values[self._diagonal].mean()
-        right = np.zeros(2 * self.num_verts)
-        slots = np.stack([2 * self.faces, 2 * self.faces + 1], -1).reshape(-1)
-        right -= np.bincount(slots, force.reshape(-1), minlength=len(right))
-        return self._solve(values, right).reshape(-1, 2)
+        pull = (area * force).reshape(-1)
+        right = -np.bincount(self._unknown, pull, minlength=2 * self.num_verts)
+        return self._solve(values, right).reshape(-1, 2)[self._place]
 
     def _solve(self, values: np.ndarray, right: np.ndarray) -> np.ndarray:
         from scipy.sparse import csc_matrix
 
         matrix = csc_matrix((values, self._indices, self._indptr), (len(right), len(right)))
-        return factorised(matrix).solve(right)
+        return factorised(matrix, _ORDERED).solve(right)
 
     def _search(
         self, uv: np.ndarray, step: np.ndarray, before: np.ndarray
@@ -115,7 +133,84 @@ class NewtonSolver:
         return trial, self.energies(trial)
 
 
-def factorised(matrix: Any) -> Any:
+def relaxed_charts(
+    faces: Int[np.ndarray, "F 3"],
+    rest: RestShape,
+    chart: Int[np.ndarray, "F"],
+    uv: Float[np.ndarray, "W 2"],
+    steps: int,
+    gain: float,
+) -> Float[np.ndarray, "W 2"]:
+    """Newton steps on charts in groups, in threads; the groups depend on the charts alone.
+
+    Args:
+        faces: vertex indices; charts share no vertex.
+        rest: rest shape of the faces.
+        chart: of each face.
+        uv: coordinates without a flipped face.
+        steps: at most so many for each group.
+        gain: see `NewtonSolver.run`.
+
+    Returns:
+        Coordinates of lower energy; vertices of no face stay.
+    """
+    out = uv.copy()
+    excess = (face_energy(rest.jacobians(uv[faces])) - 4) * rest.area
+    enough = 0.5 * float(excess.sum() / max(rest.area.sum(), 1e-300))
+
+    def work(some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        used, local = np.unique(faces[some], return_inverse=True)
+        _, number = np.unique(chart[some], return_inverse=True)
+        solver = NewtonSolver(local.reshape(-1, 3), rest.of_faces(some), number, len(used))
+        return used, solver.run(uv[used], steps, gain, enough)
+
+    for used, found in in_threads(work, _groups(chart)):
+        out[used] = found
+    return out
+
+
+def _groups(chart: np.ndarray) -> list[np.ndarray]:
+    """Faces of charts that are solved together, the groups with most of them first."""
+    _, number, size = np.unique(chart, return_inverse=True, return_counts=True)
+    if len(size) == 0:
+        return []
+    order = np.argsort(-size, kind="stable")
+    before = np.concatenate([[0], np.cumsum(size[order])[:-1]])
+    group = np.zeros(len(size), np.int64)
+    group[order] = before // _GROUP
+    of_face = np.unique(group, return_inverse=True)[1][number]
+    faces = np.argsort(of_face, kind="stable")
+    return np.split(faces, np.searchsorted(of_face[faces], np.arange(1, of_face.max() + 1)))
+
+
+def in_threads(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """The results of independent pieces of work in their order, computed in two threads.
+
+    Args:
+        work: a function of one piece.
+        items: the pieces.
+
+    Returns:
+        Its results.
+    """
+    if len(items) < 2:
+        return [work(item) for item in items]
+    with ThreadPoolExecutor(min(len(items), _THREADS)) as pool:
+        return list(pool.map(work, items))
+
+
+def _sparse_order(faces: np.ndarray, count: int) -> np.ndarray:
+    """Place of each vertex in an elimination order of minimum degree."""
+    from scipy.sparse import coo_matrix, diags
+
+    ends = np.concatenate([faces.reshape(-1), np.roll(faces, -1, 1).reshape(-1)])
+    others = np.concatenate([np.roll(faces, -1, 1).reshape(-1), faces.reshape(-1)])
+    joined = coo_matrix((np.ones(len(ends)), (ends, others)), (count, count)).tocsc()
+    degree = np.asarray(joined.sum(1)).ravel()
+    return factorised((diags(degree + 1) - joined).tocsc()).perm_c.astype(np.int64)
+
+
+def factorised(matrix: Any, symmetric: dict[str, Any] = _SYMMETRIC) -> Any:
     """LU factors of a symmetric positive definite sparse matrix.
 
     A matrix that rounding made singular (needles, faces without area) is tried again with pivots,
@@ -123,6 +218,7 @@ def factorised(matrix: Any) -> Any:
 
     Args:
         matrix: a `scipy.sparse.csc_matrix`.
+        symmetric: options of the first try, which looks for no pivots.
 
     Returns:
         An object with ``solve``.
@@ -142,22 +238,12 @@ def factorised(matrix: Any) -> Any:
     size = size + max(float(size.mean()), 1e-300)
     for share in (0.0, *_HELD):
         held = (matrix + diags(share * size)).tocsc() if share else matrix
-        for options in (_SYMMETRIC, {}):
+        for options in (symmetric, {}):
             try:
                 return splu(held, **options)
             except RuntimeError:  # a pivot of zero
                 continue
     raise InputError("verts, faces: expected a mesh that can be flattened, found one that cannot")
-
-
-def _spread(rest: RestShape) -> np.ndarray:
-    """Matrices (F, 4, 6) from the coordinates of three corners to the entries of the Jacobian."""
-    inverse = rest.inverse
-    corner = np.stack([-inverse.sum(1), inverse[:, 0], inverse[:, 1]], 1)  # (F, corner, column)
-    out = np.zeros((len(inverse), 2, 2, 3, 2))
-    for axis in range(2):
-        out[:, axis, :, :, axis] = corner.transpose(0, 2, 1)
-    return out.reshape(-1, 4, 6)
 
 
 def _first_flip(corner: np.ndarray, step: np.ndarray) -> np.ndarray:

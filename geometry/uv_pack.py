@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Int
 from .errors import InputError
 
 _TURNS = 12
-_COARSE, _FINE = 128, 384
-_TRIALS = 24
+_COARSE, _FINE = 96, 384
+_TRIALS = 18
+_WORKERS = 2
 _FREE, _MANY = 60, 150
 """Up to the first number of charts all orders are tried; above the second boxes go on shelves."""
 
@@ -243,7 +244,17 @@ class _Board:
 
     def widened(self) -> "_Board":
         """The same with more room."""
-        canvas = _round_up(int(1.3 * self.canvas))
+        return self.with_canvas(_round_up(int(1.3 * self.canvas)))
+
+    def narrowed(self, width: int) -> "_Board":
+        """The same with room for a square of some cells: transforms cost what the canvas holds."""
+        canvas = _round_up(width)
+        return self if canvas > 0.93 * self.canvas else self.with_canvas(canvas)
+
+    def with_canvas(self, canvas: int) -> "_Board":
+        """The same on another canvas, which holds every stamp."""
+        need = max(max(s.mask.shape) for own in self.stamps for s in own)
+        canvas = max(canvas, _round_up(need))
         return _Board(
             self.stamps, [_spectra(own, canvas) for own in self.stamps], self.unit, canvas
         )
@@ -258,7 +269,7 @@ class _Board:
         for chart in recipe.order:
             stamps = self.stamps[chart]
             spectrum = np.asarray(fft.fft2(taken.astype(np.complex64)))
-            hits = np.asarray(fft.ifft2(spectrum * self.spectra[chart]))
+            hits = np.asarray(fft.ifft2(spectrum * self.spectra[chart], workers=_WORKERS))
             best, found = -8.0, None
             for which, stamp in enumerate(stamps):
                 if recipe.goals is None:
@@ -293,7 +304,7 @@ def _spectra(stamps: list[Stamp], canvas: int) -> np.ndarray:
     for own, stamp in zip(both, stamps, strict=True):
         height, width = stamp.mask.shape
         own[:height, :width] = stamp.mask + 1j * stamp.rim
-    return np.conj(np.asarray(fft2(both)))
+    return np.conj(np.asarray(fft2(both, workers=_WORKERS)))
 
 
 def _worth(hits: np.ndarray, stamp: Stamp, width: int, bias: float) -> np.ndarray:
@@ -350,6 +361,7 @@ def _searched(board: _Board, sizes: np.ndarray) -> tuple[int, _Recipe]:
             best = (width, _Recipe(order, recipe.bias, turns, goals))
             width -= max(1, width // 100)
             places = board.placed(recipe, width)
+        board = board.narrowed(best[0])
     if best is None:
         raise InputError("charts: expected charts that fit a square, found none that do")
     return best
@@ -369,6 +381,7 @@ def _tightest(board: _Board, recipe: _Recipe, width: int) -> Packing:
         places = board.placed(recipe, width)
         if places is None:
             width += max(1, width // 100)
+    board = board.narrowed(width)
     best, step = (width, places), max(1, width // 64)
     while step:
         # each step starts from the last good places, pulled together

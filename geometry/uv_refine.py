@@ -9,14 +9,20 @@ from jaxtyping import Int
 from .uv_charts import Atlas, first_guess, halves
 from .uv_energy import ISOMETRIC
 from .uv_mirror import chart_mates, mirrored_edges, symmetric_edges
-from .uv_split import fiedler, separators, split_paths, tip_slits
+from .uv_split import charts_after, fiedler, separators, sign_changes, split_paths, tip_slits
 
 _ROUNDS = 80
-_TRIAL_STEPS = 12
-_FINAL_STEPS = 40
+_TRIAL_STEPS = (5, 12)
+_FINAL_STEPS = (15, 40)
+"""Fewest and most Newton steps; the most up to `_LARGE` faces, fewer in proportion above."""
+_LARGE = 50_000
+_NEAR = 1.5
+"""Excess, in that of the target, below which the charts are relaxed before more are cut."""
 _CHART_PRICE = 0.15
 """What a chart costs, as a length of seam, in units of the square root of the area."""
-_SEAM_PRICE = 0.05
+_FOLD_PRICE = 0.0
+"""What a chart that lies on itself costs, in charts."""
+_SEAM_PRICE = 0.1
 """What any seam costs, however short."""
 
 Progress = Callable[[str, float], None]
@@ -49,7 +55,7 @@ def refined(
     Returns:
         Discs of at most the target energy, none of which lies on itself.
     """
-    atlas = atlas.relaxed(_FINAL_STEPS)
+    atlas = atlas.relaxed(_steps(_FINAL_STEPS, atlas))
     atlas = _towards(atlas, target, max_charts, progress)
     for _ in range(_ROUNDS):
         pairs = atlas.overlaps()
@@ -59,12 +65,23 @@ def refined(
     return atlas
 
 
+def _steps(bounds: tuple[int, int], atlas: Atlas) -> int:
+    least, most = bounds
+    return max(least, min(most, most * _LARGE // max(len(atlas.cut.faces), 1)))
+
+
 def _towards(
     atlas: Atlas, target: float, max_charts: int | None, progress: Progress | None
 ) -> Atlas:
     known: dict[tuple[int, ...], Move] = {}
+    near = False
     for _ in range(_ROUNDS):
         energy = atlas.mean_energy
+        if not near and energy - ISOMETRIC < _NEAR * (target - ISOMETRIC):
+            # what the trials left undone is a part of the excess by now
+            atlas, near = atlas.relaxed(_steps(_FINAL_STEPS, atlas)), True
+            energy = atlas.mean_energy
+            known.clear()
         if progress is not None:
             progress("charts", min(0.99, (target - 4) / max(energy - 4, 1e-9)))
         full = max_charts is not None and atlas.cut.num_charts >= max_charts
@@ -80,7 +97,7 @@ def _towards(
         seams = np.concatenate([move.edges for move in chosen])
         opened = atlas.opened(seams)
         atlas = opened.carried(opened.cut, corner)
-    return atlas.relaxed(_FINAL_STEPS, gain=1e-4)
+    return atlas.relaxed(_steps(_FINAL_STEPS, atlas), gain=1e-4)
 
 
 def _best(moves: list[Move], atlas: Atlas, target: float) -> list[Move]:
@@ -162,9 +179,10 @@ def _moves_of(atlas: Atlas, units: list[tuple[int, ...]], edges: np.ndarray) -> 
         groups.append(own[~cut.seams[own]])
     trial = atlas.opened(np.concatenate(groups))
     active = np.isin(cut.chart, np.concatenate(units))
-    trial = trial.relaxed(_TRIAL_STEPS, active)
+    trial = trial.relaxed(_steps(_TRIAL_STEPS, atlas), active)
     corner, before, after = trial.corner_uv, atlas.face_excess, trial.face_excess
     scale = float(np.sqrt(atlas.rest.area.sum()))
+    folded = np.unique(trial.cut.chart[trial.overlaps(active)[:, 0]])
     # what was cut besides, to come to discs, belongs to the move: its coordinates need it
     fresh = np.flatnonzero(trial.cut.seams & ~cut.seams)
     owner = cut.chart[cut.edges.face_pairs[fresh, 0]]
@@ -172,7 +190,9 @@ def _moves_of(atlas: Atlas, units: list[tuple[int, ...]], edges: np.ndarray) -> 
     for unit in units:
         own = fresh[np.isin(owner, unit)]
         faces = np.flatnonzero(np.isin(cut.chart, unit))
-        new = len(np.unique(trial.cut.chart[faces])) - len(unit)
+        pieces = np.unique(trial.cut.chart[faces])
+        # a piece that lies on itself has to be cut later
+        new = len(pieces) - len(unit) + _FOLD_PRICE * np.isin(pieces, folded).sum()
         price = _SEAM_PRICE + float(surface.length[own].sum()) / scale + _CHART_PRICE * new
         gain = float(before[faces].sum() - after[faces].sum())
         moves.append(Move(own, faces, corner[faces], gain, price))
@@ -184,17 +204,45 @@ def _is_own_mate(atlas: Atlas, chart: int) -> bool:
 
 
 def _separated(atlas: Atlas, pairs: Int[np.ndarray, "n 2"]) -> Atlas:
-    """Every chart that lies on itself cut between the faces that meet."""
-    cut, surface = atlas.cut, atlas.surface
-    field = fiedler(surface, cut, first_guess(surface)[cut.origin], atlas.rest.area)
+    """Every chart that lies on itself cut in two, so that most of the faces that meet part."""
+    cut, surface, area = atlas.cut, atlas.surface, atlas.rest.area
     charts = np.unique(cut.chart[pairs[:, 0]])
-    field = separators(surface, cut, pairs, field)
     meets = np.bincount(pairs.reshape(-1), minlength=len(cut.chart)) > 0
-    edges = split_paths(surface, cut, field, atlas.rest.area * (meets + 0.01), charts)
-    edges = edges[~cut.seams[edges]]
-    chart = cut.chart[np.maximum(cut.edges.face_pairs[edges, 0], 0)]
-    missed = np.setdiff1d(charts, chart)
-    if len(missed):
-        edges = np.union1d(edges, halves(surface, cut, missed, atlas.rest.area))
+    start = first_guess(surface)[cut.origin]
+    slow = fiedler(surface, cut, start, area, charts)
+    folded = fiedler(surface, cut, start, area * (meets + 0.01), charts)
+    fields = [(separators(surface, cut, pairs, f), area * (meets + 0.01)) for f in (slow, folded)]
+    fields += [(slow, area), (folded, area * (meets + 0.01))]
+    options = [split_paths(surface, cut, field, weight, charts) for field, weight in fields]
+    options.append(sign_changes(cut, fields[0][0]))
+    edges = _parting(atlas, pairs, options)
+    if len(edges) == 0:
+        return atlas.opened(cut.edges.of_face[pairs[:, 0]].reshape(-1))
     active = np.isin(cut.chart, charts)
-    return atlas.opened(edges).relaxed(_TRIAL_STEPS, active)
+    return atlas.opened(edges).relaxed(_steps(_TRIAL_STEPS, atlas), active)
+
+
+def _parting(atlas: Atlas, pairs: np.ndarray, options: list[np.ndarray]) -> np.ndarray:
+    """Of ways to cut the charts, for each the one that parts most pairs for its length.
+
+    The last way, along every line, makes many charts: it is for those that no other helps.
+    """
+    cut = atlas.cut
+    before = np.bincount(cut.chart[pairs[:, 0]], minlength=cut.num_charts)
+    stays, least = before.copy(), np.full(cut.num_charts, np.inf)
+    best: dict[int, np.ndarray] = {}
+    for number, option in enumerate(options):
+        edges = option[~cut.seams[option]]
+        owner = cut.chart[np.maximum(cut.edges.face_pairs[edges, 0], 0)]
+        after = charts_after(cut, edges)
+        joined = after[pairs[:, 0]] == after[pairs[:, 1]]
+        remain = np.bincount(cut.chart[pairs[joined, 0]], minlength=cut.num_charts)
+        length = np.bincount(owner, atlas.surface.length[edges], minlength=cut.num_charts)
+        price = (remain + 0.05 * before) * length
+        better = (before > 0) & (np.bincount(owner, minlength=cut.num_charts) > 0) & (price < least)
+        if number == len(options) - 1:
+            better &= 2 * stays > before
+        for chart in np.flatnonzero(better).tolist():
+            best[chart] = edges[owner == chart]
+        stays[better], least[better] = remain[better], price[better]
+    return np.concatenate([np.zeros(0, np.int64), *best.values()])

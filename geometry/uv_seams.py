@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .uv_energy import RestShape, flat_triangles
 from .uv_mesh import CutMesh, MeshEdges
 
 _VIEWS = 48
@@ -31,6 +32,16 @@ class Surface:
         return self.edges.faces
 
     @cached_property
+    def flat(self) -> Float[np.ndarray, "F 2 2"]:
+        """Every triangle laid into the plane."""
+        return flat_triangles(self.verts, self.faces)
+
+    @cached_property
+    def rest(self) -> RestShape:
+        """Rest shape of the triangles."""
+        return RestShape.of_flat(self.flat)
+
+    @cached_property
     def length(self) -> Float[np.ndarray, "E"]:
         """Length of each edge."""
         a, b = self.verts[self.edges.verts].transpose(1, 0, 2)
@@ -53,6 +64,19 @@ class Surface:
         found = mirror_of(verts, faces) if symmetric else None
         mirror, side = (None, None) if found is None else found
         return cls(verts, MeshEdges.of(faces), mirror, side)
+
+    @property
+    def curvature(self) -> float:
+        """Sum of the absolute angle defects of the inner vertices: 4π for a convex surface."""
+        side = np.roll(self.verts[self.faces], -1, 1) - self.verts[self.faces]
+        back = -np.roll(side, 1, 1)
+        size = np.linalg.norm(side, axis=-1) * np.linalg.norm(back, axis=-1)
+        cosine = (side * back).sum(-1) / np.maximum(size, 1e-300)
+        angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+        total = np.bincount(self.faces.reshape(-1), angle.reshape(-1), minlength=len(self.verts))
+        inner = np.bincount(self.faces.reshape(-1), minlength=len(self.verts)) > 0
+        inner[self.edges.verts[~self.edges.joinable]] = False
+        return float(np.abs(2 * np.pi - total[inner]).sum())
 
     def graph(self, cut: CutMesh, cost: Float[np.ndarray, "E"] | None = None) -> Any:
         """Vertices of a cut mesh joined by its uncut edges, weighted by cost."""
@@ -300,7 +324,9 @@ def _handles(surface: Surface, cut: CutMesh, bad: Bool[np.ndarray, "C"]) -> np.n
     weight = 2 * loop[free].max(initial=1.0) - loop[free][chosen]
     rows = (pairs[chosen, 0], pairs[chosen, 1])
     tree = minimum_spanning_tree(coo_matrix((weight, rows), (count, count)).tocsr()).tocoo()
-    used = np.isin(pairs[chosen, 0] * count + pairs[chosen, 1], tree.row * count + tree.col)
+    # the indices of a sparse matrix are of 32 bits: too few for the square of a large count
+    kept = tree.row.astype(np.int64) * count + tree.col
+    used = np.isin(pairs[chosen, 0].astype(np.int64) * count + pairs[chosen, 1], kept)
     rest = np.setdiff1d(free, free[chosen[used]])
     ends = np.concatenate([a[rest], b[rest]])
     return np.union1d(inner[rest], path_edges(surface, cut, before, ends))

@@ -29,6 +29,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from monopart.geometry.body import BodyModel
 from monopart.geometry.errors import InputError
 
 from .atomic import write_bytes
@@ -79,6 +80,18 @@ def content_key(*things: Any) -> str:
     for thing in things:
         _feed(digest, thing)
     return digest.hexdigest()
+
+
+def uv_fingerprint(body: BodyModel) -> str:
+    """What tells bodies of different texture coordinates apart.
+
+    Args:
+        body: the body.
+
+    Returns:
+        64 hexadecimal digits; those of nothing for a body without coordinates.
+    """
+    return content_key(None if body.uv is None else body.uv.corner_uv.detach().cpu().float())
 
 
 def _feed(digest: Any, thing: Any) -> None:

@@ -21,7 +21,7 @@ from monopart.geometry.errors import InputError, MonopartError
 
 from .atomic import write_bytes
 from .avatar import Avatar
-from .cache import content_key
+from .cache import content_key, uv_fingerprint
 from .captures.cache import Pictures
 from .captures.patches import PixelBatch
 from .captures.records import CaptureRecord, Split
@@ -112,6 +112,7 @@ def save_culprit(
         "image_size": record.image_size,
         "frames": train.frames,
         "body": _fingerprint(record.body),
+        "uv": uv_fingerprint(record.body),
     }
     path = folder / f"step_{bad.step:06d}.safetensors"
     contiguous = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
@@ -233,7 +234,8 @@ def load_culprit(path: Path, body: BodyModel | None = None) -> Culprit:
             facts = json.loads((file.metadata() or {})["monopart"])
         if facts["format"] != FORMAT:
             raise ValueError(f"format {facts['format']}")
-        if facts["body"] != _fingerprint(body):
+        uv = uv_fingerprint(body)
+        if facts["body"] != _fingerprint(body) or facts.get("uv", uv) != uv:
             raise InputError(f"{path}: expected its body, found another; name it by --body")
         record = _record(facts, tensors, path, body)
         config = config_of(facts["config"], str(path))

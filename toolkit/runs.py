@@ -11,7 +11,7 @@ from monopart.geometry.errors import InputError
 
 from .atomic import write_json, write_text
 from .avatar import Avatar
-from .cache import user_cache
+from .cache import user_cache, uv_fingerprint
 from .captures import Reading, read_capture
 from .captures.records import CaptureRecord
 from .checkpoint import WEIGHTS, load_weights
@@ -81,7 +81,17 @@ def _capture_facts(record: CaptureRecord) -> dict[str, Any]:
         test_scale=record.test_scale,
         legacy_pixels=record.legacy_pixels,
     )
-    return {"path": str(record.root.resolve()), **dataclasses.asdict(how)}
+    place = {"path": str(record.root.resolve()), "uv": uv_fingerprint(record.body)}
+    return place | dataclasses.asdict(how)
+
+
+def _check_uv(run: Path, stored: Any, record: CaptureRecord) -> None:
+    """Refuse a body of other texture coordinates: the residual of a run is a function of them."""
+    if stored is not None and stored != uv_fingerprint(record.body):
+        raise InputError(
+            f"{run / 'capture.json'}: expected the body that the run was trained with, found one "
+            "of other texture coordinates; name that body file in the entry body, or train again"
+        )
 
 
 def read_facts(path: Path) -> dict[str, Any]:
@@ -153,11 +163,11 @@ def open_run(run: Path, capture: Path | None = None, device: torch.device = CPU)
     if not (run / WEIGHTS).is_file():
         raise InputError(f"{run / WEIGHTS}: expected trained weights, found no file; train first")
     config = from_json(run / "config.json")
-    reading = None
+    reading, stored_uv = None, None
     if (run / "capture.json").is_file():
         stored = read_facts(run / "capture.json")
         path, params = stored.get("path"), stored.get("params")
-        reading = _reading(stored)
+        reading, stored_uv = _reading(stored), stored.get("uv")
         if not (isinstance(path, str) and isinstance(params, str)):
             raise InputError(
                 f"{run / 'capture.json'}: expected texts path and params, found {stored}; "
@@ -174,6 +184,7 @@ def open_run(run: Path, capture: Path | None = None, device: torch.device = CPU)
             f"{capture}: expected the capture of {run}, found nothing; name it by --capture"
         )
     record = read_capture(capture, reading=reading).to(device)
+    _check_uv(run, stored_uv, record)
     torch.manual_seed(config.seed)
     avatar = Avatar.create(record, config, user_cache())
     load_weights(avatar.model, run)

@@ -115,6 +115,17 @@ def test_weights_of_another_configuration(run):
         open_run(run)
 
 
+def test_a_body_of_other_texture_coordinates(run):
+    path = run / "capture.json"
+    facts = json.loads(path.read_text())
+    assert len(facts["uv"]) == 64
+    open_run(run)
+    facts["uv"] = "0" * 64
+    path.write_text(json.dumps(facts))
+    with pytest.raises(InputError, match=r"other texture coordinates; name that body file"):
+        open_run(run)
+
+
 def test_a_capture_that_has_moved(run, small_capture):
     stored = {"path": "/nowhere", "params": "new_params"}
     (run / "capture.json").write_text(json.dumps(stored))

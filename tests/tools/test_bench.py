@@ -3,6 +3,7 @@
 No time is asserted: only that the clocks, the errors and the files are there.
 """
 
+import dataclasses
 import importlib.util
 import json
 import math
@@ -16,7 +17,7 @@ import torch
 
 from monopart.geometry.body import BodyModel, BodyPose
 from monopart.geometry.errors import InputError
-from monopart.tools.bench import compare, results, suite
+from monopart.tools.bench import compare, results, suite, uv
 from monopart.tools.bench.bodies import near_points, pose_list, surface_data
 from monopart.tools.bench.cli import main
 from monopart.tools.bench.meshes import subdivided
@@ -27,6 +28,7 @@ from monopart.tools.bench.show import cells, markdown
 from monopart.tools.bench.skinning_methods import plain_arrays, plain_skinning
 from monopart.tools.bench.surface_methods import judge_surface
 from monopart.tools.bench.timing import Effort, measure, spread
+from monopart.tools.bench.unwrap_meshes import MESHES
 
 SPREAD = {"median", "min", "q1", "q3", "count"}
 ROW = {"method", "ours", "size", "setting", "wall", "cpu", "error", "facts"}
@@ -61,6 +63,43 @@ def _run(name: str, out: Path, *arguments: str) -> dict:
     for plot in out.glob("*.svg"):
         ElementTree.parse(plot)
     return data
+
+
+@pytest.mark.slow
+def test_meshes_of_the_uv_suite() -> None:
+    assert {o.name for o in uv.operations()} == set(MESHES)
+    for name in ("ring", "two_rings", "holes", "part_3"):
+        data = MESHES[name][1]()
+        assert data.faces.max() == len(data.verts) - 1
+        assert len(data.parts) == len(data.faces) > 500
+
+
+@pytest.mark.slow
+def test_uv_suite(tmp_path: Path) -> None:
+    data = _run("uv", tmp_path, "--only", "ring")
+    rows = {row["method"]: row for row in data["tables"][0]["rows"]}
+    assert {"monopart", "monopart, few charts", "xatlas", "LSCM (libigl) on cut parts"} <= set(rows)
+    for row in rows.values():
+        if row["ours"]:
+            assert row["facts"]["flips"] == row["facts"]["overlaps"] == 0
+    assert rows["monopart"]["error"] <= 0.0301
+    report = results.read_report(tmp_path / "uv.json")
+    lines = uv.tables(report).splitlines()
+    assert sum(line.startswith("| **monopart") for line in lines) == 2
+    page = tmp_path / "page.md"
+    page.write_text("a\n<!-- uv: begin -->\nold\n<!-- uv: end -->\nb\n")
+    with pytest.raises(InputError, match="--quick run"):
+        uv.write_page(report, page)
+    full = dataclasses.replace(report, quick=False)
+    uv.write_page(full, page)
+    text = page.read_text()
+    assert text.startswith("a\n") and text.endswith("b\n") and "old" not in text
+    assert "### Ring, 80 faces" in text
+    page.write_text("no marks")
+    with pytest.raises(InputError, match="marks"):
+        uv.write_page(full, page)
+    with pytest.raises(InputError, match="expected a Markdown page"):
+        uv.write_page(full, tmp_path / "none.md")
 
 
 @pytest.mark.slow

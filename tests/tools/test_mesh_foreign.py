@@ -36,6 +36,7 @@ def test_broken_files_arerefused(tmp_path, capsys, name):
 
 
 WORK = {
+    "unwrap": (["unwrap", "--no-picture"], "r.obj"),
     "partition": (["partition", "--no-picture"], "r.ply"),
     "distance": (["bake", "distance", "--no-picture", "--unsigned", "--spacing", "0.25"], "r.npz"),
     "check": (["check", "--picture-size", "64"], "r.json"),

@@ -23,6 +23,7 @@ SUITES = {
     "training": "PSNR against seconds of every preset on each CAPTURE",
     "render": "seconds per picture of RUN",
     "skipping": "samples that are left of a picture, and what a training step saves",
+    "uv": "texture coordinates of ten meshes: seconds, distortion, charts, seams, packing",
     "scaling": "time against rays, samples, frames, parts, joints, mesh size, points, threads",
 }
 
@@ -45,6 +46,8 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument("run", type=Path, metavar="RUN_OR_CAPTURE")
         if name == "geometry":
             command.add_argument("--poses", type=int, default=20, metavar="N")
+        if name == "uv":
+            command.add_argument("--into", type=Path, metavar="PAGE", help="write tables into it")
         if name in ("geometry", "render", "skipping"):
             command.add_argument("--capture", type=Path, metavar="DIR")
         command.add_argument("--only", action="append", default=[], metavar="OPERATION")
@@ -179,7 +182,7 @@ def _suite(arguments: argparse.Namespace) -> None:
 
 def _reports(arguments: argparse.Namespace, settings: Settings) -> Iterator["Report"]:
     """The report of a suite; of training, one per capture."""
-    from . import fields, geometry, render, scaling, skipping
+    from . import fields, geometry, render, scaling, skipping, uv
     from .show import save_report
     from .suite import run_suite
 
@@ -199,9 +202,11 @@ def _reports(arguments: argparse.Namespace, settings: Settings) -> Iterator["Rep
             yield run_training(dataclasses.replace(settings, capture=capture), keep)
         return
     rooms = {"geometry": geometry, "fields": fields, "render": render}
-    rooms |= {"scaling": scaling, "skipping": skipping}
+    rooms |= {"scaling": scaling, "skipping": skipping, "uv": uv}
     operations = rooms[arguments.command].operations()
     report = run_suite(arguments.command, operations, settings, keep)
+    if arguments.command == "uv" and arguments.into is not None:
+        uv.write_page(report, arguments.into)
     yield scaling.with_exponents(report) if arguments.command == "scaling" else report
 
 

@@ -36,7 +36,16 @@ def section(report: Report, name: str, folder: str) -> str:
     return "\n".join(out).strip() + "\n"
 
 
-def _grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table.
+
+    Args:
+        head: of the columns.
+        rows: cells.
+
+    Returns:
+        The lines, an empty one last.
+    """
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     return [*lines, *("| " + " | ".join(row) + " |" for row in rows), ""]
 
@@ -48,7 +57,7 @@ def _compared(table: Table, summaries: list[Summary]) -> list[str]:
     size = main_size(summaries)
     rows = [cells(s) for s in summaries if s.size == size]
     shown = [[row[i] for i in _KEPT] for row in rows]
-    return [f"Size {size}. Error: {table.error}.", "", *_grid(HEAD, shown)]
+    return [f"Size {size}. Error: {table.error}.", "", *grid(HEAD, shown)]
 
 
 def _grown(summaries: list[Summary]) -> list[str]:
@@ -62,7 +71,7 @@ def _grown(summaries: list[Summary]) -> list[str]:
         [f"**{name}**" if bold else name, *(at.get((name, size), "") for size in sizes)]
         for name, bold in ours.items()
     ]
-    return _grid(["median by size", *(str(size) for size in sizes)], rows)
+    return grid(["median by size", *(str(size) for size in sizes)], rows)
 
 
 def _times(table: Table) -> list[str]:
@@ -72,7 +81,7 @@ def _times(table: Table) -> list[str]:
     names = dict.fromkeys(r.method for r in table.rows)
     rows = [[name, *(at.get((name, target), "–") for target in targets)] for name in names]
     text = "CPU seconds (seconds of the clock) to a PSNR in dB; – where it was not reached."
-    return [text, "", *_grid(["preset", *(f"{t / 10:g}" for t in targets)], rows)]
+    return [text, "", *grid(["preset", *(f"{t / 10:g}" for t in targets)], rows)]
 
 
 def _time(row: Row) -> str:
