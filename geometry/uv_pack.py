@@ -361,7 +361,8 @@ def _searched(board: _Board, sizes: np.ndarray) -> tuple[int, _Recipe]:
             best = (width, _Recipe(order, recipe.bias, turns, goals))
             width -= max(1, width // 100)
             places = board.placed(recipe, width)
-        board = board.narrowed(best[0])
+        if best is not None:  # always, here
+            board = board.narrowed(best[0])
     if best is None:
         raise InputError("charts: expected charts that fit a square, found none that do")
     return best

@@ -28,8 +28,8 @@ def _by(parts: bool = False, **options: Any) -> Callable[[Any], Callable[[], Any
 
 
 def _methods() -> tuple[Method, ...]:
-    few = {"target": 4.15}
-    whole = {"chart_share": 1.0}
+    few: dict[str, Any] = {"target": 4.15}
+    whole: dict[str, Any] = {"chart_share": 1.0}
     return (
         Method("monopart", _by(), ours=True, single=True),
         Method("monopart, few charts", _by(**few), ours=True, single=True),
