@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .camera_checks import intrinsics_from_fov
 from .cameras import Camera
 from .errors import InputError
 from .norms import brought_to_one
@@ -43,8 +44,7 @@ def orbit_cameras(
     Raises:
         InputError: a count below one, an axis of zero length.
     """
-    if count < 1:
-        raise InputError(f"count: expected at least one camera, found {count}; pass count >= 1")
+    _check_count(count)
     axis, pivot = _axis(up).to(camera.K), center.to(camera.K)
     cross = torch.linalg.cross(axis.expand(3, 3), torch.eye(3).to(axis)).mT
     cameras = []
@@ -94,15 +94,36 @@ def ring_of_cameras(
         raise InputError(f"distance: expected metres above 0, found {distance}; give a length")
     if not abs(elevation) < math.pi / 2:
         raise InputError(f"elevation: expected radians within π/2, found {elevation}; lower it")
-    axis = _axis(up)
+    _check_count(count)
+    axis = _axis(up.to(target))
+    across, side = _across(axis)
+    K, back = intrinsics_from_fov(axis, size, fov), distance * torch.eye(3).to(axis)[2]
+    cameras = []
+    for i in range(count):
+        angle = 2 * math.pi * i / count
+        outwards = math.cos(angle) * across + math.sin(angle) * side
+        right = math.cos(angle) * side - math.sin(angle) * across
+        # Axes as they are, where look_at would divide by the cosine of the elevation.
+        down = math.sin(elevation) * outwards - math.cos(elevation) * axis
+        forward = -math.cos(elevation) * outwards - math.sin(elevation) * axis
+        R = torch.stack((right, down, forward))
+        cameras.append(Camera(K, R, back - R @ target, size))
+    return cameras
+
+
+def _across(axis: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Two unit vectors across an axis and each other, the second a quarter turn on."""
     # Some jump is unavoidable on a sphere: this one is far from the axes of the world.
     other = torch.zeros_like(axis)
     other[1 if bool(axis[0].abs() > NEAR_X) else 0] = 1
     across = torch.linalg.cross(axis, other)
     across = across / across.norm()
-    arm = math.cos(elevation) * across + math.sin(elevation) * axis
-    first = Camera.look_at(target + distance * arm, target, axis, size, fov=fov)
-    return orbit_cameras(first, target, axis, count)
+    return across, torch.linalg.cross(axis, across)
+
+
+def _check_count(count: int) -> None:
+    if count < 1:
+        raise InputError(f"count: expected at least one camera, found {count}; pass count >= 1")
 
 
 def blend_cameras(first: Camera, last: Camera, count: int) -> list[Camera]:
