@@ -208,8 +208,8 @@ def _ring() -> Stress:
     return Stress(
         name="ring_of_cameras",
         title="cameras around a point",
-        domain="any finite point, axis of any length and elevation short of a pole; a view loses the "
-        "digits of the target over the distance to it",
+        domain="any finite point, axis of any length and elevation short of a pole; a view loses "
+        "the digits of the target over the distance to it",
         error="1 + target over distance",
         families=tuple(families),
         ways=(Way("monopart", run, True),),
