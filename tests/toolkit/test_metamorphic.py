@@ -24,10 +24,11 @@ from monopart.toolkit.train import Trainer
 
 STEPS, BAND = 12, 2
 # Largest and mean change of a colour in [0, 1]. Training turns roundings into steps of its
-# optimiser, so a trained avatar differs by more than an untrained one.
+# optimiser, so a trained avatar differs by more than an untrained one: at single pixels of the
+# outline most, so that the bound of the mean is the one that catches a fault.
 UNTRAINED = (1e-4, 1e-6)
-TRAINED = (5e-2, 2e-4)
-FAR = (5e-2, 4e-4)  # 100 m away, where a metre is known to 7.6e-6
+TRAINED = (0.1, 2e-4)
+FAR = (0.1, 4e-4)  # 100 m away, where a metre is known to 7.6e-6
 MIRRORED = (2e-2, 3e-4)  # untrained: hash tables start with other random numbers on other sides
 MIRRORED_TRAINED = (0.3, 5e-3)
 
