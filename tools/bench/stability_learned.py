@@ -126,7 +126,7 @@ def _on_lines(bank: _Bank, kind: str) -> Make:
 
 
 def exact_bank(
-    bank: _Bank, points: np.ndarray, lines: np.ndarray, weights: np.ndarray
+    bank: Any, points: np.ndarray, lines: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:
     """Blend the lines, then look every axis up by linear interpolation."""
     blended = np.einsum("q,qakc->akc", weights[0, 0], lines[0])
