@@ -47,7 +47,7 @@ class Seen:
     @property
     def random(self) -> int:
         """Rows before those of the patch."""
-        return len(self.color) - (math.prod(self.patch) if self.patch else 0)
+        return _before_patch(self.color, self.patch)
 
     def mean(self, loss: Callable[[Tensor, Tensor], Tensor], patch_pixels: float) -> Tensor:
         """A colour loss over all rows that count.
@@ -73,12 +73,16 @@ def seen_batch(
         patch: height and width of the patch in the last rows, or None.
         counted: [N] on the host, False where a pixel is ignored; None: all count.
     """
-    rows = len(color) - (math.prod(patch) if patch else 0)
+    rows = _before_patch(color, patch)
     if counted is None:
         return Seen(color, target, patch, (rows, len(color) - rows))
     known, numbers = sent(counted, color.device)[:, None], (counted[:rows], counted[rows:])
     shown = torch.where(known, color, target)
     return Seen(shown, target, patch, (int(numbers[0].sum()), int(numbers[1].sum())))
+
+
+def _before_patch(color: Tensor, patch: tuple[int, int] | None) -> int:
+    return len(color) - (math.prod(patch) if patch else 0)
 
 
 class Objective:

@@ -1,7 +1,7 @@
 """Stress of posed bodies and of inverse skinning."""
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from monopart.geometry.surface import closest_point
 from monopart.geometry.unskin import inverse_skin
 
 from .registry import load
-from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, Backend, Family, Inputs, Stress, Way, kinds_of
 from .stability_rotations import Make, axes, exact_rotmat
 from .stability_skinning import exact_chain
 
@@ -45,12 +45,12 @@ def exact_body(extra: None, pose: np.ndarray, betas: np.ndarray) -> np.ndarray:
     return (np.einsum("vab,vb->va", linear, bent) + weights @ shift)[::16]
 
 
-def _body_way(backend: Literal["warp", "torch"]) -> Way:
+def _body_way(backend: Backend) -> Way:
     def run(extra: None, pose: Tensor, betas: Tensor) -> Tensor:
         still = pose.new_zeros(3)
         return BodyModel.default()(BodyPose(pose, betas, still, still), backend).verts[::16]
 
-    kinds = (SINGLE,) if backend == "warp" else (SINGLE, DOUBLE)
+    kinds = kinds_of(backend)
     return Way(f"monopart {backend}", run, True, kinds)
 
 

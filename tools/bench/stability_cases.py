@@ -3,7 +3,7 @@
 import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -12,6 +12,12 @@ from torch import Tensor
 Inputs = tuple[Tensor, ...]
 SINGLE, DOUBLE = torch.float32, torch.float64
 HALVES = (torch.float16, torch.bfloat16)
+Backend = Literal["warp", "torch"]
+
+
+def kinds_of(backend: Backend) -> tuple[torch.dtype, ...]:
+    """Precisions of a back end: kernels are made for float32."""
+    return (SINGLE,) if backend == "warp" else (SINGLE, DOUBLE)
 
 
 @dataclass(frozen=True)

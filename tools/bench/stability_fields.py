@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from monopart.fields.mlp import PartMLP
 from monopart.fields.occupancy import PartOccupancy
 from monopart.fields.residual import ResidualField
 
-from .stability_cases import DOUBLE, HALVES, SINGLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, HALVES, SINGLE, Backend, Family, Inputs, Stress, Way, kinds_of
 from .stability_meshes import ball
 from .stability_rotations import Make
 
@@ -73,11 +73,11 @@ def exact_grid(grid: HashGrid, points: np.ndarray, table: np.ndarray) -> np.ndar
     return np.concatenate(out, 1)
 
 
-def _grid_way(backend: Literal["warp", "torch"]) -> Way:
+def _grid_way(backend: Backend) -> Way:
     def run(grid: HashGrid, points: Tensor, table: Tensor) -> Tensor:
         return functional_call(grid, {"table": table}, (points, None, backend))
 
-    kinds = (SINGLE,) if backend == "warp" else (SINGLE, DOUBLE)
+    kinds = kinds_of(backend)
     return Way(f"monopart {backend}", run, True, kinds)
 
 

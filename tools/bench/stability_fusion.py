@@ -1,7 +1,7 @@
 """Stress of the attention over codes as a whole, of pose banks in their weights, and of RowAdam."""
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,9 +13,9 @@ from monopart.fields.occupancy import PartOccupancy
 from monopart.fields.pose_bank import PoseBank
 from monopart.fields.row_adam import RowAdam
 
-from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, Backend, Family, Inputs, Stress, Way, kinds_of
 from .stability_fields import Nets, exact_layers
-from .stability_learned import exact_adam, exact_attention, exact_bank
+from .stability_learned import Bank, exact_adam, exact_attention, exact_bank
 from .stability_rotations import Make
 
 _RATE = 0.01
@@ -143,20 +143,7 @@ def _code_fusion() -> Stress:
 # --- pose banks: gradients in the weights of the key poses -------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class _Bank:
-    """One bank of a part in both precisions, and its number of key poses."""
-
-    nets: Nets
-    poses: int
-
-    @classmethod
-    def of(cls, poses: int, knots: int) -> "_Bank":
-        lo, hi = torch.tensor([[-1.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.5, 3.0]])
-        return cls(Nets.of(lambda: PoseBank(lo, hi, poses, knots, 4)), poses)
-
-
-def _weighted(bank: _Bank, kind: str) -> Make:
+def _weighted(bank: Bank, kind: str) -> Make:
     def make(generator: torch.Generator, count: int) -> Inputs:
         net = bank.nets.double
         lines = torch.randn(net.lines.shape, generator=generator, dtype=DOUBLE)
@@ -179,19 +166,19 @@ def _weighted(bank: _Bank, kind: str) -> Make:
     return make
 
 
-def _bank_scale(bank: _Bank, exact: np.ndarray, p: Any, lines: np.ndarray, w: np.ndarray) -> float:
+def _bank_scale(bank: Bank, exact: np.ndarray, p: Any, lines: np.ndarray, w: np.ndarray) -> float:
     return float(np.abs(lines).max() * lines.shape[3] * max(np.abs(w).sum(), 1e-30))
 
 
 def _bank_weights() -> list[Stress]:
-    def run(bank: _Bank, points: Tensor, lines: Tensor, weights: Tensor) -> Tensor:
+    def run(bank: Bank, points: Tensor, lines: Tensor, weights: Tensor) -> Tensor:
         part = torch.zeros(len(points), dtype=torch.long)
         rows = torch.arange(bank.poses)[None, None]
         return functional_call(
             bank.nets.like(points), {"lines": lines}, (points, part, None, rows, weights, "torch")
         )
 
-    def blend(bank: _Bank, points: Tensor, lines: Tensor, weights: Tensor) -> Tensor:
+    def blend(bank: Bank, points: Tensor, lines: Tensor, weights: Tensor) -> Tensor:
         module = _WithLines(bank.nets.like(points), lines)
         # every key pose twice: their shares add up
         rows = torch.arange(bank.poses).repeat(2)[None, None]
@@ -204,13 +191,13 @@ def _bank_weights() -> list[Stress]:
             out += weight * lines[0, pose]
         return out.reshape(-1, lines.shape[-1])
 
-    usual = _Bank.of(5, 16)
+    usual = Bank.of(5, 16)
     kinds = ("usual", "one weight of 1", "weights of 0", "weights of 1e-30", "weights of 1e30")
     kinds = (*kinds, "weights that cancel", "equal key poses")
     families = [
         Family(k, _weighted(usual, k), extra=usual, step=1e-7, smooth="1e" not in k) for k in kinds
     ]
-    one, many = _Bank.of(1, 2), _Bank.of(300, 8)
+    one, many = Bank.of(1, 2), Bank.of(300, 8)
     families.append(Family("one key pose", _weighted(one, "usual"), extra=one, step=1e-7))
     families.append(Family("300 key poses", _weighted(many, "usual"), extra=many, step=1e-7))
     stress = Stress(
@@ -253,7 +240,7 @@ class _WithLines:
 # --- the optimiser as torch calls it -----------------------------------------------------------
 
 
-def _optimiser(backend: Literal["warp", "torch"]) -> Way:
+def _optimiser(backend: Backend) -> Way:
     """Steps of `RowAdam`: gradients set on the parameter, two groups of its state."""
 
     def run(steps: int, table: Tensor, grad: Tensor) -> Tensor:
@@ -269,7 +256,7 @@ def _optimiser(backend: Literal["warp", "torch"]) -> Way:
             optimiser.zero_grad()
         return own.detach()
 
-    kinds = (SINGLE,) if backend == "warp" else (SINGLE, DOUBLE)
+    kinds = kinds_of(backend)
     return Way("monopart", run, True, kinds, differentiable=False)
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,16 +16,9 @@ from monopart.fields.part_field import PartField, PartFieldSpec
 from monopart.fields.pose_bank import PoseBank
 from monopart.fields.row_adam import AdamRule, RowMoments, row_adam
 
-from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, Backend, Family, Inputs, Stress, Way, kinds_of
 from .stability_fields import Nets, exact_grid, exact_layers
 from .stability_rotations import Make
-
-Backend = Literal["warp", "torch"]
-
-
-def _kinds(backend: Backend) -> tuple[torch.dtype, ...]:
-    return (SINGLE,) if backend == "warp" else (SINGLE, DOUBLE)
-
 
 # --- density and colour of a part --------------------------------------------------------------
 
@@ -91,19 +84,20 @@ def _part_field() -> Stress:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Bank:
+class Bank:
     """One bank in both precisions, of one part whose box is not a cube."""
 
     nets: Nets
     poses: int
 
     @classmethod
-    def of(cls, poses: int, knots: int) -> "_Bank":
+    def of(cls, poses: int, knots: int) -> "Bank":
+        """A bank of so many key poses and knots."""
         lo, hi = torch.tensor([[-1.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.5, 3.0]])
         return cls(Nets.of(lambda: PoseBank(lo, hi, poses, knots, 4)), poses)
 
 
-def _on_lines(bank: _Bank, kind: str) -> Make:
+def _on_lines(bank: Bank, kind: str) -> Make:
     def make(generator: torch.Generator, count: int) -> Inputs:
         lines = torch.randn(bank.nets.double.lines.shape, generator=generator, dtype=DOUBLE)
         share = torch.rand(count, 3, generator=generator, dtype=DOUBLE)
@@ -126,7 +120,7 @@ def _on_lines(bank: _Bank, kind: str) -> Make:
 
 
 def exact_bank(
-    bank: Any, points: np.ndarray, lines: np.ndarray, weights: np.ndarray
+    bank: Bank, points: np.ndarray, lines: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:
     """Blend the lines, then look every axis up by linear interpolation."""
     blended = np.einsum("q,qakc->akc", weights[0, 0], lines[0])
@@ -141,24 +135,24 @@ def exact_bank(
 
 
 def _bank_way(backend: Backend) -> Way:
-    def run(bank: _Bank, points: Tensor, lines: Tensor, weights: Tensor) -> Tensor:
+    def run(bank: Bank, points: Tensor, lines: Tensor, weights: Tensor) -> Tensor:
         part = torch.zeros(len(points), dtype=torch.long)
         rows = torch.arange(bank.poses)[None, None]
         inputs = (points, part, None, rows, weights, backend)
         return functional_call(bank.nets.like(points), {"lines": lines}, inputs)
 
-    return Way(f"monopart {backend}", run, True, _kinds(backend))
+    return Way(f"monopart {backend}", run, True, kinds_of(backend))
 
 
 def _pose_bank() -> Stress:
-    usual = _Bank.of(4, 16)
+    usual = Bank.of(4, 16)
     kinds = ("inside", "knots", "outside", "1e30 m off", "infinite", "a weight of 0")
     kinds = (*kinds, "weights of 1e-30")
     families = [Family(k, _on_lines(usual, k), extra=usual) for k in kinds]
     for name, bank in (
-        ("one key pose", _Bank.of(1, 16)),
-        ("two knots", _Bank.of(4, 2)),
-        ("4096 knots", _Bank.of(4, 4096)),
+        ("one key pose", Bank.of(1, 16)),
+        ("two knots", Bank.of(4, 2)),
+        ("4096 knots", Bank.of(4, 4096)),
     ):
         families.append(Family(name, _on_lines(bank, "inside"), extra=bank))
     return Stress(
@@ -208,7 +202,7 @@ def _attention_way(backend: Backend) -> Way:
     def run(extra: None, query: Tensor, keys: Tensor, values: Tensor) -> Tensor:
         return attend(query, keys, values, (len(query),), backend)
 
-    return Way(f"monopart {backend}", run, True, _kinds(backend))
+    return Way(f"monopart {backend}", run, True, kinds_of(backend))
 
 
 def _attention() -> Stress:
@@ -302,7 +296,7 @@ def _adam_way(backend: Backend) -> Way:
             row_adam(table, factor * grad, moments, now, _RATE, AdamRule(), backend)
         return table
 
-    return Way(f"monopart {backend}", run, True, _kinds(backend), differentiable=False)
+    return Way(f"monopart {backend}", run, True, kinds_of(backend), differentiable=False)
 
 
 def _adam() -> Stress:

@@ -1,7 +1,6 @@
 """Stress of kinematics, skinning, bodies and their inverse; the oracles are float64 loops."""
 
 import dataclasses
-from typing import Literal
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from monopart.geometry.rotations import axis_angle_to_rotmat
 from monopart.geometry.skinning import SkinWeights, blend_skin, blend_transforms, skin, unskin
 
 from .registry import load
-from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, SINGLE, Backend, Family, Inputs, Stress, Way, kinds_of
 from .stability_rotations import Make, axes
 
 FAR = 1e5
@@ -68,11 +67,11 @@ def _joint_rows(transforms: Tensor, joints: Tensor) -> Tensor:
     return torch.cat((linear, posed[..., None]), -1).reshape(-1, 3, 4)
 
 
-def _kinematics_way(backend: Literal["warp", "torch"]) -> Way:
+def _kinematics_way(backend: Backend) -> Way:
     def run(tree: KinematicTree, rotmats: Tensor, joints: Tensor) -> Tensor:
         return _joint_rows(forward_kinematics(tree, rotmats, joints, backend), joints)
 
-    kinds = (SINGLE,) if backend == "warp" else (SINGLE, DOUBLE)
+    kinds = kinds_of(backend)
     return Way(f"monopart {backend}", run, True, kinds)
 
 
@@ -209,12 +208,12 @@ def _skin_scale(
     return np.full(len(exact), max(largest, 1e-30))
 
 
-def _skin_way(backend: Literal["warp", "torch"]) -> Way:
+def _skin_way(backend: Backend) -> Way:
     def run(extra: _Weighted, points: Tensor, transforms: Tensor) -> Tensor:
         weights = extra.like(points)
         return blend_skin(points, transforms, weights, backend)
 
-    kinds = (SINGLE,) if backend == "warp" else (SINGLE, DOUBLE)
+    kinds = kinds_of(backend)
     return Way(f"monopart {backend}", run, True, kinds)
 
 

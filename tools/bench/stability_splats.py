@@ -1,7 +1,5 @@
 """Stress of 3D Gaussians as a camera sees them, and of their pictures."""
 
-from typing import Literal
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,7 +16,7 @@ from monopart.fields.splats import (
 )
 from monopart.geometry.cameras import Camera
 
-from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, Backend, Family, Inputs, Stress, Way, kinds_of
 from .stability_rotations import Make, axes, exact_rotmat
 
 _FOCAL, _SIDE = 24.0, 12
@@ -113,13 +111,11 @@ def _projection() -> Stress:
 # --- pictures ----------------------------------------------------------------------------------
 
 
-def _picture(backend: Literal["torch", "warp"]) -> Way:
+def _picture(backend: Backend) -> Way:
     def run(extra: None, *parts: Tensor) -> Tensor:
         return render_gaussians(Gaussians(*parts), _camera(parts[0]), backend).flatten(0, 1)
 
-    return Way(
-        f"monopart {backend}", run, True, (SINGLE,) if backend == "warp" else (SINGLE, DOUBLE)
-    )
+    return Way(f"monopart {backend}", run, True, kinds_of(backend))
 
 
 def exact_picture(extra: None, *parts: np.ndarray) -> np.ndarray:

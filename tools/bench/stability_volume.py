@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 from collections.abc import Callable
-from typing import Literal
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from monopart.fields.occupancy import visible_samples
 from monopart.fields.part_union import union_by_density
 from monopart.fields.volume import composite
 
-from .stability_cases import DOUBLE, SINGLE, Family, Inputs, Stress, Way
+from .stability_cases import DOUBLE, Backend, Family, Inputs, Stress, Way, kinds_of
 from .stability_rotations import Make
 from .stability_splats import splats
 
@@ -63,12 +62,12 @@ def exact_composite(
     return out
 
 
-def _composite_way(backend: Literal["warp", "torch"]) -> Way:
+def _composite_way(backend: Backend) -> Way:
     def run(rays: _Rays, sigma: Tensor, color: Tensor, delta: Tensor) -> Tensor:
         seen = composite(sigma, color, delta, rays.start, backend=backend)
         return torch.cat((seen.color, seen.opacity[:, None]), 1)
 
-    kinds = (SINGLE,) if backend == "warp" else (SINGLE, DOUBLE)
+    kinds = kinds_of(backend)
     return Way(f"monopart {backend}", run, True, kinds)
 
 
