@@ -5,7 +5,6 @@ written last, says that it is complete. All cells are checked before the first o
 """
 
 import json
-import os
 import shlex
 import shutil
 import time
@@ -22,6 +21,7 @@ from .arguments import resolve
 from .atomic import write_json
 from .captures import read_capture
 from .config import Config, from_json
+from .environment import usable_cores
 from .grid import Variant, explicit, same_but_for_name
 from .metrics import Protocol
 from .progress import progress_bar
@@ -235,7 +235,7 @@ def ablate(
     for name, other in equal.items():
         say(f"{name}: the same configuration as {other}; not trained again")
     with locked(plan.out) as lock:
-        threads = max(1, (os.cpu_count() or 1) // plan.jobs)
+        threads = max(1, usable_cores() // plan.jobs)
         failed = _run(
             plan, open_cells, start or (lambda a, log: start_process(a, log, threads, lock))
         )

@@ -92,6 +92,16 @@ def peak_memory_bytes() -> int | None:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
+def usable_cores() -> int:
+    """Processor cores that this process may run on: those of ``taskset`` or a container.
+
+    >>> usable_cores() >= 1
+    True
+    """
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else (os.cpu_count() or 1)
+
+
 def environment_facts() -> dict[str, Any]:
     """Collect what a reader needs to judge a run's timings and to repeat it.
 
@@ -107,13 +117,12 @@ def environment_facts() -> dict[str, Any]:
     import torch
 
     memory = _memory_bytes()
-    affinity = getattr(os, "sched_getaffinity", None)
     return {
         "python": platform.python_version(),
         "os": _system(),
         "machine": platform.machine(),
         "cpu": _cpu_model(),
-        "cores": len(affinity(0)) if affinity else (os.cpu_count() or 1),
+        "cores": usable_cores(),
         "memory_gib": None if memory is None else round(memory / 2**30, 1),
         "packages": {name: _version(names) for name, names in _PACKAGES.items()},
         "git_commit": _git_commit(),
