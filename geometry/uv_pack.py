@@ -7,9 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .errors import InputError
+from .uv_coverage import coverage
 
-_TURNS = 12
-_COARSE, _FINE = 96, 384
+_COARSE, _FINE = ((96, 12), (64, 24)), 384
+"""Cells of the coarse grids and turns that a chart may have on each; cells of the fine grid."""
+_GOOD = 0.65
+"""Share of the square at which the second coarse grid is not tried."""
 _TRIALS = 18
 _WORKERS = 2
 _FREE, _MANY = 60, 150
@@ -49,7 +52,8 @@ def packed(
 ) -> Packing:
     """Pack charts into the unit square at one common scale.
 
-    Many orders are tried on a coarse grid; the best one is repeated on a fine grid. More than 150
+    Many orders are tried on a coarse grid; the best one is repeated on a fine grid; all that on a
+    second coarse grid where the first one leaves more than a third of the square. More than 150
     charts go on shelves, box by box: looser, but in a time that grows with their number alone.
 
     Args:
@@ -68,11 +72,17 @@ def packed(
     faces = [corner[rows] for rows in _rows_of(chart, count)]
     if count > _MANY:
         return _shelved(faces, margin / size)
-    coarse = _Board.of(faces, sizes, _COARSE, margin * _COARSE / size, _TURNS)
-    width, recipe = _searched(coarse, sizes)
-    fine = int(np.clip(size // 2, 2 * _COARSE, _FINE))
-    board = _Board.of(faces, sizes, fine, margin * fine / size, _TURNS, recipe.turns)
-    return _tightest(board, recipe, int(width * fine / _COARSE) + 2)
+    best = None
+    for grid, turns in _COARSE:
+        coarse = _Board.of(faces, sizes, grid, margin * grid / size, turns)
+        width, recipe = _searched(coarse, sizes)
+        fine = int(np.clip(size // 2, 2 * _COARSE[0][0], _FINE))
+        board = _Board.of(faces, sizes, fine, margin * fine / size, turns, recipe.turns)
+        found = _tightest(board, recipe, int(width * fine / grid) + 2)
+        best = found if best is None or found.scale > best.scale else best
+        if best.scale**2 * sizes.sum() >= _GOOD:
+            break
+    return cast(Packing, best)
 
 
 def _rows_of(chart: np.ndarray, count: int) -> list[np.ndarray]:
@@ -157,45 +167,6 @@ def _level_angle(points: np.ndarray) -> float:
     return -float(angles[int(box.argmin())])
 
 
-def coverage(
-    corner: Float[np.ndarray, "F 3 2"], gap: float
-) -> tuple[Bool[np.ndarray, "h w"], Float[np.ndarray, "2"]]:
-    """Cells of a unit grid that come nearer than a gap to some triangles; a few more at corners.
-
-    Args:
-        corner: corners of the triangles in cells, in any order of turn.
-        gap: distance, cells.
-
-    Returns:
-        The mask (rows are v) and the coordinates of its lower left corner.
-    """
-    low = np.floor(corner.min((0, 1)) - gap)
-    corner = corner - low
-    first = np.floor(corner.min(1) - gap).astype(np.int64)
-    last = np.floor(corner.max(1) + gap).astype(np.int64)
-    wide = last - first + 1
-    number = wide[:, 0] * wide[:, 1]
-    face = np.repeat(np.arange(len(corner)), number)
-    rank = np.arange(len(face)) - np.repeat(np.cumsum(number) - number, number)
-    cell = np.stack(
-        [first[face, 0] + rank % wide[face, 0], first[face, 1] + rank // wide[face, 0]], 1
-    )
-    middle = cell + 0.5
-    side = np.roll(corner, -1, 1) - corner
-    turned = np.sign(side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0])
-    inside = np.ones(len(face), bool)
-    for k in range(3):
-        normal = np.stack([-side[:, k, 1], side[:, k, 0]], 1) * turned[:, None]
-        length = np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
-        normal /= length[:, None]
-        reach = 0.5 * np.abs(normal).sum(1) + gap
-        offset = (normal * corner[:, k]).sum(1)
-        inside &= (normal[face] * middle).sum(1) - offset[face] >= -reach[face]
-    mask = np.zeros((int(last[:, 1].max()) + 1, int(last[:, 0].max()) + 1), bool)
-    mask[cell[inside, 1], cell[inside, 0]] = True
-    return mask, low
-
-
 @dataclass(frozen=True, eq=False)
 class _Recipe:
     """How charts are put down one after the other."""
@@ -218,6 +189,8 @@ class _Board:
     unit: float
     """Cells per unit of length."""
     canvas: int
+    turns: int
+    """Number of turns of a chart; a stamp's number is of those, or of every so many of them."""
 
     @classmethod
     def of(
@@ -240,7 +213,7 @@ class _Board:
             stamps.append(_stamps(own * unit, gap / 2, some, count))
         need = max(max(s.mask.shape) for own in stamps for s in own)
         canvas = _round_up(max(int(1.25 * grid), need + 2))
-        return cls(stamps, [_spectra(own, canvas) for own in stamps], unit, canvas)
+        return cls(stamps, [_spectra(own, canvas) for own in stamps], unit, canvas, count)
 
     def widened(self) -> "_Board":
         """The same with more room."""
@@ -256,7 +229,11 @@ class _Board:
         need = max(max(s.mask.shape) for own in self.stamps for s in own)
         canvas = max(canvas, _round_up(need))
         return _Board(
-            self.stamps, [_spectra(own, canvas) for own in self.stamps], self.unit, canvas
+            self.stamps,
+            [_spectra(own, canvas) for own in self.stamps],
+            self.unit,
+            canvas,
+            self.turns,
         )
 
     def placed(self, recipe: _Recipe, width: int) -> list[tuple[int, int, int]] | None:
@@ -370,7 +347,7 @@ def _searched(board: _Board, sizes: np.ndarray) -> tuple[int, _Recipe]:
 
 def _turn_number(board: _Board, chart: int, which: int) -> int:
     count = len(board.stamps[chart])
-    return which * (_TURNS // count) if count < _TURNS else which
+    return which * max(1, board.turns // 4) if count < board.turns else which
 
 
 def _tightest(board: _Board, recipe: _Recipe, width: int) -> Packing:
