@@ -1,19 +1,9 @@
-"""Our consistency loss in a dynamic NeRF that knows nothing of us; runs in seconds.
-
-Its warp leads from a moving scene back to a still one (D-NeRF and its followers). Colours alone
-leave it free to fold; a second warp that leads forward again, and two calls of ours, bind it.
-"""
+"""Our consistency loss in a foreign dynamic NeRF, which warps to a still scene (as D-NeRF does)."""
 
 import torch
 from torch import Tensor, nn
 
 from monopart.geometry import consistency_loss, round_trip
-
-
-def mlp(inputs: int) -> nn.Sequential:
-    """Numbers of a sample to three numbers."""
-    first, second = nn.Linear(inputs, 64), nn.Linear(64, 64)
-    return nn.Sequential(first, nn.SiLU(), second, nn.SiLU(), nn.Linear(64, 3))
 
 
 def scene(points: Tensor, time: Tensor) -> Tensor:
@@ -25,19 +15,15 @@ def scene(points: Tensor, time: Tensor) -> Tensor:
 def train(weight: float = 0.03, steps: int = 300) -> tuple[list[float], list[float]]:
     """Colour errors, and mean ways of points there and back in metres, of each step."""
     torch.manual_seed(0)
-    backward, forward, color = mlp(4), mlp(4), mlp(3)  # the foreign method's, but for `forward`
-    nets = nn.ModuleList([backward, forward, color])
-    optimizer = torch.optim.Adam(nets.parameters(), lr=3e-3)
-    errors, gaps = [], []
+    sizes = ((4, 64), (64, 64), (64, 3))  # of each network: a point and a time to three numbers
+    layers = [[f for s in sizes for f in (nn.Linear(*s), nn.SiLU())][:-1] for _ in range(3)]
+    nets = nn.ModuleList(nn.Sequential(*each) for each in layers)
+    optimizer, errors, gaps = torch.optim.Adam(nets.parameters(), lr=3e-3), [], []
     for _ in range(steps):
         points, time = torch.rand(512, 3) - 0.5, torch.rand(512, 1)
-        still = points + backward(torch.cat([points, time], -1))
-        error = (color(still) - scene(points, time)).square().mean()
-        gap = round_trip(
-            points,
-            lambda _, still=still: still,
-            lambda p, time=time: p + forward(torch.cat([p, time], -1)),
-        )
+        back, forth, color = (lambda p, f=f, t=time: f(torch.cat([p, t], -1)) for f in nets)
+        error = (color(points + back(points)) - scene(points, time)).square().mean()
+        gap = round_trip(points, lambda p, f=back: p + f(p), lambda p, f=forth: p + f(p))
         optimizer.zero_grad()
         (error + weight * consistency_loss(gap, threshold=0.005)).backward()
         optimizer.step()
