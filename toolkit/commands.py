@@ -41,7 +41,7 @@ from .results import (
     write_scores,
 )
 from .resume import load_state
-from .runs import check_free, create_run, next_free, open_run, read_facts, resumable
+from .runs import check_free, check_uv, create_run, next_free, open_run, read_facts, resumable
 from .savings import print_savings, rendering_savings, training_savings
 from .train import Trainer
 from .train_result import TrainResult
@@ -181,6 +181,7 @@ def _trainer(
         trainer = Trainer(avatar, run, pictures=pictures)
         trainer.result.capacity = capacity
         if resume:
+            check_uv(run, record)
             load_state(trainer, run)
             say(f"going on from step {trainer.result.iterations}")
         update(1.0, "")

@@ -85,11 +85,21 @@ def _capture_facts(record: CaptureRecord) -> dict[str, Any]:
     return place | dataclasses.asdict(how)
 
 
-def _check_uv(run: Path, stored: Any, record: CaptureRecord) -> None:
-    """Refuse a body of other texture coordinates: the residual of a run is a function of them."""
+def check_uv(run: Path, record: CaptureRecord) -> None:
+    """Refuse a body of other texture coordinates: the residual of a run is a function of them.
+
+    Args:
+        run: a run folder.
+        record: the capture, with the body that is to be used.
+
+    Raises:
+        InputError: the run was trained with other coordinates.
+    """
+    path = run / "capture.json"
+    stored = read_facts(path).get("uv") if path.is_file() else None
     if stored is not None and stored != uv_fingerprint(record.body):
         raise InputError(
-            f"{run / 'capture.json'}: expected the body that the run was trained with, found one "
+            f"{path}: expected the body that the run was trained with, found one "
             "of other texture coordinates; name that body file in the entry body, or train again"
         )
 
@@ -163,11 +173,11 @@ def open_run(run: Path, capture: Path | None = None, device: torch.device = CPU)
     if not (run / WEIGHTS).is_file():
         raise InputError(f"{run / WEIGHTS}: expected trained weights, found no file; train first")
     config = from_json(run / "config.json")
-    reading, stored_uv = None, None
+    reading = None
     if (run / "capture.json").is_file():
         stored = read_facts(run / "capture.json")
         path, params = stored.get("path"), stored.get("params")
-        reading, stored_uv = _reading(stored), stored.get("uv")
+        reading = _reading(stored)
         if not (isinstance(path, str) and isinstance(params, str)):
             raise InputError(
                 f"{run / 'capture.json'}: expected texts path and params, found {stored}; "
@@ -184,7 +194,7 @@ def open_run(run: Path, capture: Path | None = None, device: torch.device = CPU)
             f"{capture}: expected the capture of {run}, found nothing; name it by --capture"
         )
     record = read_capture(capture, reading=reading).to(device)
-    _check_uv(run, stored_uv, record)
+    check_uv(run, record)
     torch.manual_seed(config.seed)
     avatar = Avatar.create(record, config, user_cache())
     load_weights(avatar.model, run)

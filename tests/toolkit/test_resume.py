@@ -111,6 +111,11 @@ def test_resume_on_the_command_line(
         begun.step(step, step / 8)
         begun.result.iterations = step + 1
     begun.checkpoint()
+    facts = (run / "capture.json").read_text()
+    (run / "capture.json").write_text(json.dumps(json.loads(facts) | {"uv": "0" * 64}))
+    assert main(asked) == 2
+    assert "other texture coordinates" in capsys.readouterr().err
+    (run / "capture.json").write_text(facts)
     assert main([*asked, "--images", "1"]) is None
     assert "going on from step 5" in capsys.readouterr().err
     lines = (run / "train.jsonl").read_text().splitlines()
