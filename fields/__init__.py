@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .fusion import CodeFusion as CodeFusion
     from .hash_grid import GridSpec as GridSpec
     from .hash_grid import HashGrid as HashGrid
+    from .irradiance import irradiance_basis as irradiance_basis
     from .mlp import PartMLP as PartMLP
     from .occupancy import PartOccupancy as PartOccupancy
     from .part_field import PartField as PartField
@@ -48,6 +49,7 @@ _ROOM = {
     "Splats": "splats",
     "Union": "part_union",
     "composite": "volume",
+    "irradiance_basis": "irradiance",
     "project_gaussians": "splats",
     "render_gaussians": "splats",
     "union_by_density": "part_union",

@@ -29,6 +29,7 @@ class PartFieldSpec:
         hidden: width of the networks.
         geometry: features handed from the density to the colour network.
         code: length of the appearance feature of a sample.
+        light: further columns of that feature, which the colour alone sees.
         sharpness: density in 1/m per unit of softplus.
         density_code: whether the density sees the appearance feature too.
     """
@@ -41,6 +42,7 @@ class PartFieldSpec:
     hidden: int = 64
     geometry: int = 16
     code: int = 0
+    light: int = 0
     sharpness: float = 100.0
     density_code: bool = False
 
@@ -94,7 +96,7 @@ class PartField(torch.nn.Module):
         width = self.grid.out_features
         seen = width + (spec.code if spec.density_code else 0)
         self.density_mlp = PartMLP(parts, (seen, spec.hidden, 1 + spec.geometry))
-        inputs = width + spec.geometry + spec.code
+        inputs = width + spec.geometry + spec.code + spec.light
         self.color_mlp = PartMLP(parts, (inputs, spec.hidden, spec.hidden, 3))
 
     def encode(self, points: Float[Tensor, "n 3"], part: Int[Tensor, "n"]) -> Float[Tensor, "n w"]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from .body import BodyModel, PosedBody
 from .culling import BodyShell, ShellSamples
 from .errors import InputError
-from .posed_parts import PartHit, PartPairs, PosedParts, RestPoints
+from .posed_parts import PartHit, PartPairs, PosedParts, RestPoints, full_bary
 from .rigid import append_last_row, apply_linear, transform_points
 from .skinning import blend_transforms, unskin
 
@@ -109,6 +109,8 @@ class MovingParts(PosedParts):
         maps = blend_transforms(posed.transforms, body.weights.to(posed.transforms))
         moving.posed_maps = maps[..., :3, :].reshape(-1, 3, 4)
         rotation, translation = posed.rotation, posed.translation
+        moving.rotation = rotation.detach().to(moving.verts)
+        moving.__dict__.pop("_vertex_normals", None)  # those of the other poses
         moving.turn = rotation.mT @ rotation.detach()
         moved = (translation.detach() - translation)[..., None]
         moving.shift = (rotation.mT @ moved).squeeze(-1)
@@ -152,7 +154,7 @@ class MovingParts(PosedParts):
         points = apply_linear(turn, samples.points[pairs.sample].to(turn)) + shift
         face = self.faces[pairs.face]
         rows = (face + owner[:, None] * self.verts.shape[1]).reshape(-1)
-        held = torch.cat([pairs.bary, 1.0 - pairs.bary.sum(-1, keepdim=True)], -1)
+        held = full_bary(pairs.bary)
         corners = self.live.index_select(0, rows).unflatten(0, (-1, 3))
         bary = closest_bary(points, corners, held.to(points))
         away = _mixed(self.posed_maps, rows, bary)

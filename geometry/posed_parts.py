@@ -7,11 +7,13 @@ differentiable, in its points.
 """
 
 import copy
+import functools
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from .body import BodyModel, PosedBody
 from .culling import BodyShell, ShellSamples
@@ -20,6 +22,7 @@ from .face_tree import FaceTrees
 from .parts import PartMap, rows_of_parts
 from .rigid import append_last_row, invert_affine, transform_points
 from .skinning import blend_transforms
+from .surface import vertex_normals
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,11 @@ class PartHit:
     found: Bool[Tensor, "m"]
 
 
+def full_bary(bary: Float[Tensor, "m 2"]) -> Float[Tensor, "m 3"]:
+    """All three barycentrics from the first two."""
+    return torch.cat([bary, 1.0 - bary.sum(-1, keepdim=True)], -1)
+
+
 def _rows(transforms: Tensor) -> Tensor:
     """The upper three rows of affine maps, as [N, 3, 4], contiguous."""
     return transforms[..., :3, :].reshape(-1, 3, 4).contiguous()
@@ -110,6 +118,7 @@ class PosedParts:
         self.faces = body.faces.to(verts.device)
         self.face_part = parts.face_parts(body.weights, body.faces).to(verts.device)
         self.num_parts = len(parts.names)
+        self.rotation = posed.rotation.detach().reshape(-1, 3, 3).to(verts)
         radii = torch.as_tensor(radius, dtype=torch.float32, device=verts.device)
         self.radius = radii.expand(self.num_parts).contiguous()
         self.shell = shell or BodyShell(verts, self.faces, self.radius, self.face_part)
@@ -191,6 +200,29 @@ class PosedParts:
         launch(unskin_pairs, count, args, samples.points)
         return RestPoints(points, uv, valid)
 
+    @functools.cached_property
+    def _vertex_normals(self) -> Tensor:
+        """Of all bodies, in the world, [B V, 3]."""
+        normals = vertex_normals(self.verts, self.faces)
+        return (normals @ self.rotation.mT).reshape(-1, 3)
+
+    def world_normals(
+        self, body: Int[Tensor, "m"], face: Int[Tensor, "m"], bary: Float[Tensor, "m 2"]
+    ) -> Float[Tensor, "m 3"]:
+        """Which way the surface looks, in the world: vertex normals, interpolated.
+
+        Args:
+            body: body of each point.
+            face: face on which it lies, an index into the faces of the body.
+            bary: first two barycentrics on it.
+
+        Returns:
+            Unit normals that point outside, zero where those of the corners cancel; constants.
+        """
+        corners = self.faces[face] + body[:, None] * self.verts.shape[1]
+        normal = (self._vertex_normals[corners] * full_bary(bary)[..., None]).sum(1)
+        return functional.normalize(normal, dim=-1)
+
     def on_part(
         self, points: Float[Tensor, "m 3"], part: Int[Tensor, "m"], reach: float = 0.2
     ) -> PartHit:
@@ -211,7 +243,7 @@ class PosedParts:
         found = index >= 0
         index = index * found
         two = bary[part, rows]
-        full = torch.cat([two, 1.0 - two.sum(-1, keepdim=True)], -1)
+        full = full_bary(two)
         uv = (full[..., None] * self.corner_uv[index]).sum(-2)
         return PartHit(index, full, uv, found)
 

@@ -124,7 +124,7 @@ def feature_width(config: AppearanceConfig) -> int:
     >>> feature_width(AppearanceConfig()), feature_width(AppearanceConfig(pose_feature=True))
     (8, 16)
     >>> feature_width(AppearanceConfig(pose_feature=True, fusion=False))
-    68
+    32
     """
     if fuses(config):
         return config.fused

@@ -92,17 +92,22 @@ class AppearanceConfig:
     """Part pose embedding: lines of the key poses, which are the training frames (eq. 5)."""
     knots: int = 128
     """Values along a line of the pose embedding."""
-    channels: int = 20
+    channels: int = 8
     """Features of a line."""
     fusion: bool = True
     """Where there are pose features and codes: cross-attention over the codes of a part (eq. 6).
     Off, or where one is missing, what there is is fed directly, with one code per frame."""
-    codes: int = 100
+    codes: int = 32
     """Codes of a part that the attention chooses from."""
     fused: int = 16
     """Length of the fused feature."""
     density_sees_fusion: bool = False
     """The density sees the same feature as the colour (eq. 7)."""
+    lr: float = 0.1
+    """Factor of the learning rate of the lines: a step shows little of one frame."""
+    light: bool = True
+    """The colour sees which way the surface below looks in the world: light stands still while the
+    person turns."""
     leave_out: float = 0.5
     """Share of training poses that are blended from their neighbours, like an unseen pose."""
     blend_time: bool = False

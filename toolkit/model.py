@@ -8,6 +8,7 @@ from torch import Tensor
 
 from monopart.fields.distance_prior import DistancePrior
 from monopart.fields.hash_grid import GridSpec
+from monopart.fields.irradiance import irradiance_basis
 from monopart.fields.occupancy import PartOccupancy, visible_samples
 from monopart.fields.part_field import PartField
 from monopart.fields.part_union import union_by_density
@@ -232,6 +233,16 @@ class AvatarModel(torch.nn.Module):
         held = points.detach() + residual if points.requires_grad else canonical
         return Deformed(canonical, points + residual.detach(), held, residual, place)
 
+    def _lit(
+        self, code: Tensor | None, bodies: PosedParts, pairs: PartPairs, rows: Tensor, body: Tensor
+    ) -> Tensor | None:
+        """What the colours of some pairs see of their frame: a feature, and how light falls."""
+        if not self.config.appearance.light:
+            return code
+        normals = bodies.world_normals(body, pairs.face[rows], pairs.bary[rows])
+        light = irradiance_basis(normals)
+        return light if code is None else torch.cat([code, light], -1)
+
     def shade(
         self,
         bodies: PosedParts,
@@ -280,11 +291,12 @@ class AvatarModel(torch.nn.Module):
         with stage("colour"):
             rows = union.winner if skip.colors else torch.arange(len(sigma), device=sigma.device)
             counted = union.counts if skip.colors else pairs.counts
+            of = pairs.part[rows], owner[rows]
             if code is None:
-                part, of = pairs.part[rows], owner[rows]
-                code = self.appearance(frames, canonical[rows], part, of, counted)
+                code = self.appearance(frames, canonical[rows], *of, counted)
             else:
                 code = code.index_select(0, rows)
+            code = self._lit(code, bodies, pairs, rows, of[1])
             rgb = self.field.color(encoded[rows], geometry[rows], code, counted)
             shown = rgb if skip.colors else rgb[union.winner]
             color = rgb.new_zeros(total, 3).index_copy(0, pairs.sample[union.winner], shown)

@@ -98,7 +98,9 @@ def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam |
     for grid in _grids(model):
         grid.accumulate = sparse
         grid.deterministic = config.train.deterministic
-    loop, slower = config.train, config.deform.lr
+    loop = config.train
+    residuals = ("backward_residual.", "forward_residual.")
+    slower = {residuals: config.deform.lr, ("appearance.bank.",): config.appearance.lr}
     named = [(n, p) for n, p in model.named_parameters() if n not in CORRECTIONS]
     tables, others = (
         [(n, p) for n, p in named if n.endswith("grid.table") == is_table]
@@ -116,16 +118,16 @@ def make_optimizer(model: torch.nn.Module, config: Config) -> torch.optim.Adam |
 
 
 def _groups(
-    named: list[tuple[str, torch.nn.Parameter]], rate: float, slower: float
+    named: list[tuple[str, torch.nn.Parameter]],
+    rate: float,
+    slower: dict[tuple[str, ...], float],
 ) -> list[dict[str, Any]]:
-    """One group, or two where the residuals have a rate of their own."""
-    if slower == 1.0:
-        return [{"params": [p for _, p in named], "base_lr": rate}]
-    of_residuals = ("backward_residual.", "forward_residual.")
-    mine = [p for n, p in named if n.startswith(of_residuals)]
-    rest = [p for n, p in named if not n.startswith(of_residuals)]
-    groups = [{"params": rest, "base_lr": rate}, {"params": mine, "base_lr": rate * slower}]
-    return [group for group in groups if group["params"]]
+    """Groups by rate, in the order of the factors: 1 first, then those of prefixes of names."""
+    found: dict[float, list[torch.nn.Parameter]] = {1.0: []}
+    for name, parameter in named:
+        factor = next((f for start, f in slower.items() if name.startswith(start)), 1.0)
+        found.setdefault(factor, []).append(parameter)
+    return [{"params": p, "base_lr": rate * f} for f, p in found.items() if p]
 
 
 def pose_optimizer(corrections: torch.nn.Module, spec: RefineConfig) -> torch.optim.Adam:

@@ -30,13 +30,23 @@ SLOW = TrainConfig(
 """One patch of one frame a step, Adam at 5e-4, no accelerators (METHOD section 9)."""
 FASTER = 5.0
 """Factor of a preset's learning rate from which on a training is doubted."""
+UNLIT = AppearanceConfig(light=False)
+"""Appearance of published methods: none of them knows which way a surface looks."""
 BARE = FieldConfig(prior_slope=0.0, allocation="data")
 """No density to start from; capacity by part."""
 
 
 def _published() -> dict[str, Config]:
     """The paper as it is written, and the conventions of the authors' code."""
-    appearance = AppearanceConfig(pose_feature=True, density_sees_fusion=True, blend_time=True)
+    appearance = AppearanceConfig(
+        pose_feature=True,
+        channels=20,
+        codes=100,
+        lr=1.0,
+        light=False,
+        density_sees_fusion=True,
+        blend_time=True,
+    )
     paper = Config(
         preset="paper",
         field=BARE,
@@ -57,7 +67,7 @@ def _published() -> dict[str, Config]:
 def _baselines() -> dict[str, Config]:
     """Other methods from the same pieces, with our accelerators: one engine, other models."""
     # Appearance of these: one code per frame, no pose embedding and no fusion.
-    plain, one_way = AppearanceConfig(), LossConfig(consistency=0.0, offset=0.1)
+    plain, one_way = UNLIT, LossConfig(consistency=0.0, offset=0.1)
     instant = Config(preset="instant_nvr", loss=one_way, appearance=plain)
     single = Config(
         preset="single_part",
@@ -80,7 +90,7 @@ def _presets() -> dict[str, Config]:
     )
     tiny = Config(preset="tiny", train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0))
     rigid = Config(preset="rigid", deform=DeformConfig(residual=False))
-    full = Config(preset="full", appearance=AppearanceConfig(pose_feature=True))
+    full = Config(preset="full", appearance=dataclasses.replace(UNLIT, pose_feature=True))
     own = {"fast": fast, "best": best, "tiny": tiny, "rigid": rigid, "full": full}
     return own | _published() | _baselines()
 

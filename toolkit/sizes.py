@@ -1,5 +1,6 @@
 """Sizes of the part fields from the configuration."""
 
+from monopart.fields.irradiance import NUM_IRRADIANCE
 from monopart.fields.part_field import PartFieldSpec
 from monopart.geometry.errors import InputError
 
@@ -35,6 +36,7 @@ def field_spec(
         hidden=spec.hidden,
         geometry=spec.geometry_features,
         code=0 if appearance is None else feature_width(appearance),
+        light=NUM_IRRADIANCE if appearance is not None and appearance.light else 0,
         density_code=appearance is not None and appearance.density_sees_fusion,
         sharpness=spec.sharpness,
     )

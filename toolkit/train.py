@@ -16,7 +16,7 @@ from monopart.geometry.stages import stage
 
 from .avatar import Avatar
 from .captures.cache import Pictures, read_pictures
-from .captures.doubts import picture_doubts
+from .captures.doubts import heading_doubts, picture_doubts
 from .captures.patches import Box, PixelBatch, PixelSampler, joined
 from .checkpoint import save_weights
 from .determinism import repeatable
@@ -80,6 +80,8 @@ class Trainer:
         self.objective = Objective(self.config, canonical)
         self.generator = torch.Generator().manual_seed(self.config.seed)
         doubts = picture_doubts(avatar.record, seen, self.config.train.patch)
+        if self.config.appearance.light:
+            doubts += heading_doubts(avatar.record)
         self.result = TrainResult(warnings=doubts + preset_doubts(self.config))
         self.lpips = self._load_lpips()
         self.optimizer = make_optimizer(avatar.model, self.config)

@@ -276,3 +276,23 @@ def test_a_kept_shell_gives_the_same_samples(batch: Batch) -> None:
     assert torch.equal(again[2].face, pairs.face)
     with pytest.raises(InputError, match="shell: expected 1 bodies, found 3"):
         PosedParts(BODY, CANONICAL, CANONICAL, PARTS, RADIUS, kept)
+
+
+def test_world_normals_turn_with_the_body() -> None:
+    pose = poses()
+    pose.rotation[:] = torch.tensor([[0.0, 0, 0], [0.0, 1.2, 0.3], [-0.7, 0.2, 2.0]])
+    posed = BODY(pose)
+    parts = PosedParts(BODY, posed, CANONICAL, PARTS, RADIUS)
+    face = torch.arange(0, len(BODY.faces), 7)
+    bary = torch.full((len(face), 2), 1 / 3)
+    corners = posed.verts_world[:, BODY.faces[face]]
+    flat = torch.linalg.cross(
+        corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
+    )
+    flat = torch.nn.functional.normalize(flat, dim=-1)
+    for body in range(3):
+        found = parts.world_normals(torch.full_like(face, body), face, bary)
+        torch.testing.assert_close(found.norm(dim=-1), torch.ones(len(face)))
+        # the middle of a face looks where the face looks, but for the bend of the surface
+        assert float((found * flat[body]).sum(-1).quantile(0.1)) > 0.9
+    assert parts.world_normals(face[:0], face[:0], bary[:0]).shape == (0, 3)

@@ -1,6 +1,7 @@
 """Pose embedding and appearance in the avatar: ablations, leakage, unseen parts, one key pose."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from monopart.geometry.errors import InputError
 from monopart.toolkit.appearance import feature_width
 from monopart.toolkit.avatar import Avatar, View, view_of
 from monopart.toolkit.captures import read_capture
+from monopart.toolkit.captures.doubts import heading_doubts
 from monopart.toolkit.checkpoint import load_weights, save_weights
 from monopart.toolkit.config import Config
 from monopart.toolkit.presets import preset, with_overrides
@@ -62,6 +64,8 @@ def trained(capture: Path) -> Avatar:
         ({"pose_feature": False}, 8, "codes"),
         ({"fusion": False}, 20, "bank codes"),
         ({"pose_feature": False, "code": 0}, 0, ""),
+        ({"light": True}, 16, "bank fusion"),
+        ({"pose_feature": False, "code": 0, "light": True}, 0, ""),
     ],
 )
 def test_each_ablation_trains_every_piece_it_has(
@@ -101,6 +105,46 @@ def test_the_density_sees_the_feature_only_where_it_is_asked_to(capture: Path) -
             avatar.model.appearance.fusion.codes.mul_(-20.0)
         after = render_view(avatar, view, skip=False).opacity
         assert torch.equal(before, after) != sees
+
+
+@pytest.mark.parametrize("lit", [False, True])
+def test_a_light_stands_still_where_the_colour_sees_it(capture: Path, lit: bool) -> None:
+    avatar = make(capture, config(light=lit, pose_feature=False))
+    pose = avatar.record.poses[0]
+    turned = dataclasses.replace(pose, rotation=pose.rotation + torch.tensor([0.0, 0.8, 0.0]))
+    colors = []
+    for given in (pose, turned):  # the same rays in the frame of the body
+        bodies = avatar.pose_scene(given).parts
+        verts = bodies.verts[0]
+        target = verts[:: len(verts) // 64]
+        back = torch.nn.functional.normalize(target - verts.mean(0), dim=-1)
+        inputs = avatar.frame_input(0, given)
+        out = avatar.model.render_rays(bodies, inputs, Rays(target + 0.2 * back, -back))
+        colors.append(out.color)
+        color = avatar.model.field.color_mlp
+        out.color.sum().backward()
+        assert all(bool(p.grad.isfinite().all()) for p in color.parameters() if p.grad is not None)
+    same = torch.allclose(colors[0], colors[1], atol=1e-5)
+    assert same != lit
+
+
+@pytest.mark.parametrize(("degrees", "said"), [(40.0, True), (80.0, False), (350.0, True)])
+def test_a_person_who_hardly_turns_is_doubted(capture: Path, degrees: float, said: bool) -> None:
+    record = read_capture(capture)
+    last = record.split("train").frames[-1]
+    poses = {
+        f: dataclasses.replace(
+            pose, rotation=torch.tensor([0.0, math.radians(degrees) if f == last else 0.0, 0.0])
+        )
+        for f, pose in record.poses.items()
+    }
+    found = heading_doubts(dataclasses.replace(record, poses=poses))
+    assert bool(found) == said and (not said or "appearance.light=false" in found[0])
+    for lit in (False, True):
+        avatar = make(capture, config(light=lit))
+        avatar = dataclasses.replace(avatar, record=dataclasses.replace(avatar.record, poses=poses))
+        warned = [w for w in Trainer(avatar).result.warnings if "The person turns" in w]
+        assert warned == (found if lit else [])
 
 
 def test_skipping_does_not_change_the_image(trained: Avatar) -> None:

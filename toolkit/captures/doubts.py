@@ -1,7 +1,11 @@
 """Doubts about training pictures that can be read and yet spoil an avatar: one sentence each."""
 
+import math
+
 import torch
 from torch import Tensor
+
+from monopart.geometry.rotations import axis_angle_to_rotmat, rotation_angle
 
 from .cache import Pictures
 from .checks import share_on_mask
@@ -13,6 +17,8 @@ ON_MASK, IN_BOX = 0.8, 0.7
 """Share of the body's vertices on the mask, and of the mask in the body's box, of a sound track."""
 SPARSE = 4  # every fourth pixel and line says how bright a picture is
 LOOKED_AT = 8  # frames whose body is compared with the mask
+TURNED = 60.0
+"""Degrees between two headings from which on they show where light comes from."""
 MARGIN = 0.12  # of the longer side of the body's box, for hair and clothes
 
 
@@ -48,6 +54,28 @@ def picture_doubts(record: CaptureRecord, pictures: Pictures, patch: int) -> lis
             f"train.patch is {patch} pixels, the images are {width} by {height}: patches are cut."
         )
     return found
+
+
+def heading_doubts(record: CaptureRecord) -> list[str]:
+    """Whether the person turns so little that light cannot be told from colour.
+
+    Args:
+        record: the capture.
+
+    Returns:
+        One sentence, or none where the headings of the training frames differ enough.
+    """
+    turns = torch.stack([record.poses[f].rotation for f in record.split("train").frames])
+    rotmats = axis_angle_to_rotmat(turns)
+    angles = rotation_angle(*torch.broadcast_tensors(rotmats[:, None], rotmats[None]))
+    widest = math.degrees(float(angles.max()))
+    if widest >= TURNED:
+        return []
+    return [
+        f"The person turns by {widest:.0f} degrees in the training frames, which hardly tells "
+        "light from colour: at other headings colours may be wrong; "
+        "--set appearance.light=false leaves the light out."
+    ]
 
 
 def _named(record: CaptureRecord, pair: tuple[int, int]) -> str:

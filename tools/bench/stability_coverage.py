@@ -61,6 +61,7 @@ COVERED: dict[str, str] = {
     "PosedParts.unskin": "posed_parts_unskin",
     "PosedParts.on_part": "on_part",
     "PosedParts.reskin": "reskin",
+    "PosedParts.world_normals": "world_normals",
     "MovingParts.follow": "follow",
     "MovingParts.like": "follow",
     "PartMap.vertex_parts": "part_map",
@@ -120,6 +121,7 @@ COVERED: dict[str, str] = {
     # fields
     "HashGrid.forward": "hash_grid",
     "FrequencyEncoding.forward": "frequency",
+    "irradiance_basis": "irradiance_basis",
     "PartMLP.forward": "mlp",
     "ResidualField.forward": "residual",
     "ResidualField.encode": "residual",

@@ -12,6 +12,7 @@ from torch.func import functional_call
 from monopart.fields.distance_prior import DistancePrior
 from monopart.fields.frequency import FrequencyEncoding
 from monopart.fields.hash_grid import PRIMES, GridSpec, HashGrid
+from monopart.fields.irradiance import irradiance_basis
 from monopart.fields.mlp import PartMLP
 from monopart.fields.occupancy import PartOccupancy
 from monopart.fields.residual import ResidualField
@@ -301,6 +302,30 @@ def _occupancy() -> Stress:
     )
 
 
+def exact_irradiance(extra: None, n: np.ndarray) -> np.ndarray:
+    """The harmonics as quadratic forms."""
+    forms = np.zeros((5, 3, 3))
+    forms[0, 0, 1] = forms[1, 1, 2] = forms[2, 2, 0] = 1
+    forms[3], forms[4] = np.diag((1, -1, 0)), np.diag((-1, -1, 2))
+    return np.concatenate((n, np.einsum("ni,fij,nj->nf", n, forms, n)), 1)
+
+
+def _irradiance() -> Stress:
+    return Stress(
+        name="irradiance_basis",
+        title="harmonics of a normal",
+        domain="any vector whose square is finite",
+        error="1, and |n|² where it is larger",
+        families=tuple(
+            Family(f"|n| {size:g}", _normal(size, 3), step=1e-6 * max(size, 1.0))
+            for size in (0.0, 1e-20, 1.0, 1e9)
+        ),
+        ways=(Way("monopart", lambda e, n: irradiance_basis(n), True, (SINGLE, DOUBLE)),),
+        exact=exact_irradiance,
+        scale=lambda e, exact, n: np.maximum(1.0, (n * n).sum(1)),
+    )
+
+
 def exact_prior(prior: DistancePrior, points: np.ndarray) -> np.ndarray:
     """Trilinear look-up of the nodes, clamped to the grid."""
     values = prior.values[0, 0].double().numpy()
@@ -344,5 +369,5 @@ def stresses() -> list[Stress]:
     """Operations on encodings, networks and grids."""
     from . import stability_fusion, stability_learned
 
-    own = [_grids(), _frequency(), _networks(), _residual(), _occupancy(), _prior()]
+    own = [_grids(), _frequency(), _irradiance(), _networks(), _residual(), _occupancy(), _prior()]
     return [*own, *stability_learned.stresses(), *stability_fusion.stresses()]

@@ -290,6 +290,46 @@ def _held_hit(points: Tensor) -> PartHit:
     return _canonical_parts().on_part(points.detach(), _part_of(points))
 
 
+def _world_normals() -> Stress:
+    """Normals of surface points, against sums over the faces of a vertex in float64."""
+
+    def run(held: _Held, bary: Tensor) -> Tensor:
+        still = torch.zeros(len(bary), dtype=torch.long)
+        return held.parts.world_normals(still, torch.arange(len(bary)) * 97, bary)
+
+    def exact(held: _Held, bary: np.ndarray) -> np.ndarray:
+        verts, faces = held.parts.verts[0].double().numpy(), held.parts.faces.numpy()
+        a, b, c = (verts[faces[:, i]] for i in range(3))
+        total = np.zeros_like(verts)
+        for corner in range(3):
+            np.add.at(total, faces[:, corner], np.cross(b - a, c - a))
+        total /= np.linalg.norm(total, axis=1, keepdims=True)
+        three = np.concatenate((bary, 1 - bary.sum(1, keepdims=True)), 1)
+        normal = np.einsum("mc,mci->mi", three, total[faces[np.arange(len(bary)) * 97]])
+        normal = normal @ exact_rotmat(None, held.pose.rotation.double().numpy()[None])[0].T
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+    def places(generator: torch.Generator, count: int) -> Inputs:
+        share = torch.rand(count, 3, generator=generator, dtype=torch.float64) + 1e-3
+        return ((share / share.sum(1, keepdim=True))[:, :2],)
+
+    poses = {"rest": (0.0, 0.0), "0.3 rad": (0.3, 0.0), "π in every joint": (np.pi, 0.0)}
+    return Stress(
+        name="world_normals",
+        title="normals of posed surfaces",
+        domain="any pose and place on a face; where the normals of its corners cancel, zero",
+        error="1, the length of a normal",
+        families=tuple(
+            Family(name, places, extra=_Held.of(pose_of(*pose), 0.0, 8))
+            for name, pose in poses.items()
+        ),
+        ways=(Way("monopart", run, True, (SINGLE,), differentiable=False),),
+        exact=exact,
+        wrt=(),
+        cases=96,
+    )
+
+
 def stresses() -> list[Stress]:
     """Operations on moving parts."""
-    return [_follow(), _on_part(), _reskin()]
+    return [_follow(), _on_part(), _reskin(), _world_normals()]
