@@ -46,6 +46,7 @@ PAPER: Mapping[str, Variant] = {
     "no_consistency": _ablation("no consistency term", "loss.consistency=0", 31.63),
     "no_rgb_latent": _ablation("no rgb_latent", "appearance.code=0", 31.93),
     "no_pose_feature": _ablation("no part pose feature", "appearance.pose_feature=false", 31.88),
+    "light": Variant("with light, beyond the paper", ("appearance.light=true",)),
     "half_consistency": _ablation("weights (1, 1, ½)", "loss.consistency*=0.5", 31.74),
     "half_lpips": _ablation("weights (1, ½, 1)", "loss.lpips*=0.5", 31.86),
     "half_mse": _ablation("weights (½, 1, 1)", "loss.mse*=0.5", 31.52),

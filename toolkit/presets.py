@@ -89,7 +89,7 @@ def _presets() -> dict[str, Config]:
         train=TrainConfig(seconds=1680.0),
     )
     tiny = Config(preset="tiny", train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0))
-    rigid = Config(preset="rigid", deform=DeformConfig(residual=False))
+    rigid = Config(preset="rigid", appearance=UNLIT, deform=DeformConfig(residual=False))
     full = Config(preset="full", appearance=dataclasses.replace(UNLIT, pose_feature=True))
     own = {"fast": fast, "best": best, "tiny": tiny, "rigid": rigid, "full": full}
     return own | _published() | _baselines()
