@@ -82,12 +82,7 @@ def _baselines() -> dict[str, Config]:
 
 def _presets() -> dict[str, Config]:
     fast = Config(preset="fast")
-    best = Config(
-        preset="best",
-        field=FieldConfig(log2_size=16, allocation="data"),
-        appearance=AppearanceConfig(pose_feature=True),
-        train=TrainConfig(seconds=1680.0),
-    )
+    best = Config(preset="best", train=TrainConfig(seconds=1680.0))
     tiny = Config(preset="tiny", train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0))
     rigid = Config(preset="rigid", appearance=UNLIT, deform=DeformConfig(residual=False))
     full = Config(preset="full", appearance=dataclasses.replace(UNLIT, pose_feature=True))
