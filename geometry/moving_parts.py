@@ -110,6 +110,7 @@ class MovingParts(PosedParts):
         moving.posed_maps = maps[..., :3, :].reshape(-1, 3, 4)
         rotation, translation = posed.rotation, posed.translation
         moving.rotation = rotation.detach().to(moving.verts)
+        moving.translation = translation.detach().to(moving.verts)
         moving.__dict__.pop("_vertex_normals", None)  # those of the other poses
         moving.turn = rotation.mT @ rotation.detach()
         moved = (translation.detach() - translation)[..., None]

@@ -77,7 +77,14 @@ class PartHit:
 
 
 def full_bary(bary: Float[Tensor, "m 2"]) -> Float[Tensor, "m 3"]:
-    """All three barycentrics from the first two."""
+    """All three barycentrics from the first two.
+
+    Args:
+        bary: first two barycentrics.
+
+    Returns:
+        The same with the third, which makes their sum 1; differentiable in bary.
+    """
     return torch.cat([bary, 1.0 - bary.sum(-1, keepdim=True)], -1)
 
 
@@ -119,6 +126,7 @@ class PosedParts:
         self.face_part = parts.face_parts(body.weights, body.faces).to(verts.device)
         self.num_parts = len(parts.names)
         self.rotation = posed.rotation.detach().reshape(-1, 3, 3).to(verts)
+        self.translation = posed.translation.detach().reshape(-1, 3).to(verts)
         radii = torch.as_tensor(radius, dtype=torch.float32, device=verts.device)
         self.radius = radii.expand(self.num_parts).contiguous()
         self.shell = shell or BodyShell(verts, self.faces, self.radius, self.face_part)

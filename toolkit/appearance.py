@@ -26,12 +26,14 @@ class FrameInput:
         code: [B, C] appearance codes, or None.
         rows: [B, K, n] key poses of each body and part, or None where nothing asks for them.
         weights: [B, K, n] their weights, which sum to 1.
+        lit: [B] 0 for a body whose colours see no light, else 1; None: all see it.
     """
 
     time: Tensor
     code: Tensor | None
     rows: Tensor | None = None
     weights: Tensor | None = None
+    lit: Tensor | None = None
 
     def of(self, bodies: Tensor) -> "FrameInput":
         """What is known about some of the bodies.
@@ -40,9 +42,8 @@ class FrameInput:
             bodies: [B'] rows.
         """
         code = None if self.code is None else self.code.index_select(0, bodies)
-        if self.rows is None or self.weights is None:
-            return FrameInput(self.time[bodies], code)
-        return FrameInput(self.time[bodies], code, self.rows[bodies], self.weights[bodies])
+        others = (x if x is None else x[bodies] for x in (self.rows, self.weights, self.lit))
+        return FrameInput(self.time[bodies], code, *others)
 
 
 class Appearance(torch.nn.Module):

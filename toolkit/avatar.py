@@ -53,7 +53,8 @@ class Avatar:
         prior = None
         if config.field.prior_slope:
             prior = distance_prior(canonical.verts, record.body.faces, cache)
-        model = AvatarModel(config, record.body, canonical, len(frames), prior)
+        cameras = [record.cameras[c] for c in record.split("train").cameras]
+        model = AvatarModel(config, record.body, canonical, len(frames), prior, cameras)
         model.to(canonical.verts.device)  # initial values are drawn on the CPU: the same anywhere
         if model.corrections is not None:
             times, spec = frame_times(frames, record.fps), config.refine

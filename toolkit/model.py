@@ -1,5 +1,6 @@
 """The avatar: part fields, residuals and appearance over the geometry of posed bodies."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -8,14 +9,13 @@ from torch import Tensor
 
 from monopart.fields.distance_prior import DistancePrior
 from monopart.fields.hash_grid import GridSpec
-from monopart.fields.irradiance import irradiance_basis
 from monopart.fields.occupancy import PartOccupancy, visible_samples
 from monopart.fields.part_field import PartField
 from monopart.fields.part_union import union_by_density
 from monopart.fields.residual import UVT_GRID, ResidualField
 from monopart.fields.volume import Composite, composite
 from monopart.geometry.body import BodyModel, PosedBody
-from monopart.geometry.cameras import Rays
+from monopart.geometry.cameras import Camera, Rays
 from monopart.geometry.culling import ShellSamples
 from monopart.geometry.moving_parts import MovingParts
 from monopart.geometry.parts import PartMap, rows_of_parts
@@ -25,6 +25,7 @@ from monopart.geometry.stages import stage
 from .appearance import Appearance, FrameInput, fuses
 from .config import Config, DeformConfig
 from .corrections import PoseCorrections
+from .light import Light
 from .sizes import field_spec
 from .skipping import EVERY, Skipping
 
@@ -113,6 +114,7 @@ class AvatarModel(torch.nn.Module):
         canonical: PosedBody,
         frames: int,
         prior: DistancePrior | None = None,
+        cameras: Sequence[Camera] = (),
     ) -> None:
         """Build the modules.
 
@@ -122,6 +124,7 @@ class AvatarModel(torch.nn.Module):
             canonical: the body of the person in the canonical pose.
             frames: number of training frames.
             prior: the distance prior of that body where the caller has it; None makes one.
+            cameras: the training cameras; without one the colours see no light.
         """
         super().__init__()
         self.config = config
@@ -129,7 +132,8 @@ class AvatarModel(torch.nn.Module):
         self.num_parts = len(self.parts.names)
         lo, hi = part_boxes(body, canonical, self.parts, config.geometry.canonical_margin)
         spec, deform = config.field, config.deform
-        sizes = field_spec(spec, self.num_parts, config.appearance)
+        self.light = Light(cameras) if config.appearance.light and cameras else None
+        sizes = field_spec(spec, self.num_parts, config.appearance, self.light is not None)
         self.field = PartField(lo, hi, sizes)
         self.prior = None
         if spec.prior_slope:
@@ -233,16 +237,6 @@ class AvatarModel(torch.nn.Module):
         held = points.detach() + residual if points.requires_grad else canonical
         return Deformed(canonical, points + residual.detach(), held, residual, place)
 
-    def _lit(
-        self, code: Tensor | None, bodies: PosedParts, pairs: PartPairs, rows: Tensor, body: Tensor
-    ) -> Tensor | None:
-        """What the colours of some pairs see of their frame: a feature, and how light falls."""
-        if not self.config.appearance.light:
-            return code
-        normals = bodies.world_normals(body, pairs.face[rows], pairs.bary[rows])
-        light = irradiance_basis(normals)
-        return light if code is None else torch.cat([code, light], -1)
-
     def shade(
         self,
         bodies: PosedParts,
@@ -289,14 +283,16 @@ class AvatarModel(torch.nn.Module):
         with stage("union"):
             union = union_by_density(sigma, pairs.sample, pairs.part, total, self.num_parts)
         with stage("colour"):
-            rows = union.winner if skip.colors else torch.arange(len(sigma), device=sigma.device)
-            counted = union.counts if skip.colors else pairs.counts
+            every = torch.arange(len(sigma), device=sigma.device), pairs.counts
+            rows, counted = (union.winner, union.counts) if skip.colors else every
             of = pairs.part[rows], owner[rows]
-            if code is None:
-                code = self.appearance(frames, canonical[rows], *of, counted)
-            else:
-                code = code.index_select(0, rows)
-            code = self._lit(code, bodies, pairs, rows, of[1])
+            code = (  # the density may have seen it already
+                self.appearance(frames, canonical[rows], *of, counted)
+                if code is None
+                else code.index_select(0, rows)
+            )
+            if self.light is not None:
+                code = self.light(bodies, frames.lit, of[1], pairs, rows, code)
             rgb = self.field.color(encoded[rows], geometry[rows], code, counted)
             shown = rgb if skip.colors else rgb[union.winner]
             color = rgb.new_zeros(total, 3).index_copy(0, pairs.sample[union.winner], shown)

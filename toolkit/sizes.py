@@ -9,7 +9,10 @@ from .config import AppearanceConfig, FieldConfig
 
 
 def field_spec(
-    spec: FieldConfig, parts: int, appearance: AppearanceConfig | None = None
+    spec: FieldConfig,
+    parts: int,
+    appearance: AppearanceConfig | None = None,
+    lit: bool = False,
 ) -> PartFieldSpec:
     """Sizes of the part fields.
 
@@ -17,6 +20,7 @@ def field_spec(
         spec: the configuration.
         parts: number of parts.
         appearance: decides the length of the appearance feature of a sample; None has none.
+        lit: whether the colour sees how light falls.
 
     Raises:
         InputError: capacities of another number of parts.
@@ -36,7 +40,7 @@ def field_spec(
         hidden=spec.hidden,
         geometry=spec.geometry_features,
         code=0 if appearance is None else feature_width(appearance),
-        light=NUM_IRRADIANCE if appearance is not None and appearance.light else 0,
+        light=NUM_IRRADIANCE if lit else 0,
         density_code=appearance is not None and appearance.density_sees_fusion,
         sharpness=spec.sharpness,
     )

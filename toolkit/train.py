@@ -151,7 +151,12 @@ class Trainer:
 
     def _inputs(self) -> FrameInput:
         """Times and codes of the training frames; times with the noise that is asked for."""
-        inputs = self.avatar.training_input(self._left_out())
+        spec = self.config.appearance
+        left_out = None if self.avatar.memory.parts is None else self._drawn(spec.leave_out)
+        inputs = self.avatar.training_input(left_out)
+        unlit = self._drawn(spec.light_out) if spec.light else None
+        if unlit is not None:
+            inputs = dataclasses.replace(inputs, lit=(~unlit).float())
         jitter = self.config.deform.time_jitter
         if not jitter:
             return inputs
@@ -159,10 +164,9 @@ class Trainer:
         noise = torch.randn(frames, generator=self.generator) * jitter / max(frames - 1, 1)
         return dataclasses.replace(inputs, time=inputs.time + sent(noise, inputs.time.device))
 
-    def _left_out(self) -> Tensor | None:
-        """Training poses of a step that are treated as unseen; None where nothing asks."""
-        share = self.config.appearance.leave_out
-        if self.avatar.memory.parts is None or not share:
+    def _drawn(self, share: float) -> Tensor | None:
+        """A share of the training frames, drawn for one step; None where it is zero."""
+        if not share:
             return None
         drawn = torch.rand(len(self.scene.frames), generator=self.generator)
         return sent(drawn < share, self.avatar.device)

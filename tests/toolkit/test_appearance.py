@@ -187,7 +187,7 @@ def test_training_leaves_the_own_frame_out_at_the_rate_that_is_asked_for(capture
         count = len(trainer.scene.frames)
         hits = 0
         for _ in range(100):
-            rows = trainer.avatar.training_input(trainer._left_out()).rows
+            rows = trainer._inputs().rows
             assert rows is not None
             hits += int((rows[..., 0] == torch.arange(count)[:, None]).all(1).sum())
         own[share] = hits / (100 * count)

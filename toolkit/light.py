@@ -1,0 +1,64 @@
+"""How light falls on a sample, as far as the training cameras can tell (beyond the paper)."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from monopart.fields.irradiance import irradiance_basis
+from monopart.geometry.cameras import Camera
+from monopart.geometry.posed_parts import PartPairs, PosedParts
+
+GRAZING = 0.2
+"""Cosine at which a camera sees a surface well; at its negative it does not see it."""
+
+
+class Light(torch.nn.Module):
+    """Harmonics of the normal below a sample, in the frame of the first training camera.
+
+    A surface that looks away from all training cameras gets zeros, as does a body whose light is
+    switched off: nobody saw how light falls on it, and its colour is the mean over what was seen.
+    """
+
+    eyes: Tensor
+    axes: Tensor
+
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        """Remember where the cameras stand; there is nothing to learn.
+
+        Args:
+            cameras: the training cameras.
+        """
+        super().__init__()
+        self.register_buffer("eyes", torch.stack([c.center for c in cameras]), persistent=False)
+        self.register_buffer("axes", cameras[0].R.clone(), persistent=False)
+
+    def forward(
+        self,
+        bodies: PosedParts,
+        lit: Tensor | None,
+        body: Tensor,
+        pairs: PartPairs,
+        rows: Tensor,
+        code: Tensor | None = None,
+    ) -> Tensor:
+        """Light on the surface below some pairs, [N, 8], behind the feature that they have already.
+
+        Args:
+            bodies: the bodies.
+            lit: [B] 0 for a body whose light is switched off, else 1; None: all are lit.
+            body: [N] body of each point.
+            pairs: the pairs.
+            rows: [N] which of them.
+            code: [N, C] their feature; None: they have none.
+        """
+        normals = bodies.world_normals(body, pairs.face[rows], pairs.bary[rows])
+        towards = functional.normalize(self.eyes - bodies.translation[:, None], dim=-1)
+        facing = (normals[:, None] * towards[body]).sum(-1).amax(1)
+        seen = ((facing + GRAZING) / (2 * GRAZING)).clamp(0.0, 1.0)
+        share = seen * seen * (3 - 2 * seen)
+        if lit is not None:
+            share = share * lit[body]
+        light = irradiance_basis(normals @ self.axes.mT) * share[:, None]
+        return light if code is None else torch.cat([code, light], -1)
