@@ -129,5 +129,5 @@ def test_a_part_that_is_never_seen_trains_without_nan(
     trainer = Trainer(avatar)
     for step in range(3):
         trainer.step(step, 0.0)
-    assert not trainer.result.warnings
+    assert not [w for w in trainer.result.warnings if "The person turns by" not in w]
     assert all(bool(p.isfinite().all()) for p in avatar.model.parameters())
