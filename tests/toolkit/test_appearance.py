@@ -9,10 +9,12 @@ import torch
 from miniature import write_miniature
 from torch import Tensor
 
+from monopart.fields.irradiance import irradiance_basis
 from monopart.geometry.body import BodyPose
 from monopart.geometry.cameras import Rays
 from monopart.geometry.culling import ShellSamples
 from monopart.geometry.errors import InputError
+from monopart.geometry.posed_parts import PartPairs
 from monopart.toolkit.appearance import feature_width
 from monopart.toolkit.avatar import Avatar, View, view_of
 from monopart.toolkit.captures import read_capture
@@ -126,6 +128,38 @@ def test_a_light_stands_still_where_the_colour_sees_it(capture: Path, lit: bool)
         assert all(bool(p.grad.isfinite().all()) for p in color.parameters() if p.grad is not None)
     same = torch.allclose(colors[0], colors[1], atol=1e-5)
     assert same != lit
+
+
+def test_light_is_unknown_where_no_camera_looked(capture: Path) -> None:
+    avatar = make(capture, config(light=True, pose_feature=False))
+    light, record = avatar.model.light, avatar.record
+    assert light is not None
+    camera = record.cameras[record.split("train").cameras[0]]
+    bodies = avatar.pose_scene(record.poses[0]).parts
+    face = torch.arange(0, len(bodies.faces), 5)
+    still, bary = torch.zeros_like(face), torch.full((len(face), 2), 1 / 3)
+    pairs = PartPairs(face, still, face, bary, (len(face),))
+    found = light(bodies, None, still, pairs, torch.arange(len(face)))
+    normals = bodies.world_normals(still, face, bary)
+    towards = torch.nn.functional.normalize(camera.center - bodies.translation[0], dim=0)
+    facing = normals @ towards
+    assert bool((facing < -0.3).any()) and bool((facing > 0.3).any())
+    assert float(found[facing < -0.2].abs().max()) == 0.0
+    seen = facing > 0.2
+    expected = irradiance_basis(normals[seen] @ camera.R.mT)
+    torch.testing.assert_close(found[seen], expected)
+    code = torch.ones(len(face), 3)
+    dark = light(bodies, torch.zeros(1), still, pairs, torch.arange(len(face)), code)
+    assert torch.equal(dark, torch.cat([code, torch.zeros(len(face), 8)], 1))
+
+
+def test_a_step_leaves_out_the_light_of_some_frames(capture: Path) -> None:
+    for share, least, most in ((0.0, 1.0, 1.0), (0.25, 0.65, 0.85), (1.0, 0.0, 0.0)):
+        trainer = Trainer(make(capture, config(light_out=share)))
+        drawn = [trainer._inputs().lit for _ in range(100)]
+        mean = sum(1.0 if lit is None else float(lit.mean()) for lit in drawn) / 100
+        assert least <= mean <= most
+    assert Trainer(make(capture, config(light=False)))._inputs().lit is None
 
 
 @pytest.mark.parametrize(("degrees", "said"), [(40.0, True), (80.0, False), (350.0, True)])
