@@ -1,5 +1,6 @@
 """monopart-mesh on what others leave behind: a result or a clear error, inputs left alone."""
 
+import dataclasses
 import hashlib
 
 import numpy as np
@@ -26,13 +27,62 @@ def test_foreign_files_are_read(tmp_path, capsys, name):
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_broken_files_arerefused(tmp_path, capsys, name):
+def test_broken_files_are_refused(tmp_path, capsys, name):
     (path,) = written(tmp_path, {name: BAD[name]})
     out = tmp_path / "result.npz"
     for argv in (["convert", path, "-o", out], ["check", path, "-o", tmp_path / "r.json"]):
         words = refused(capsys, *argv)
-        assert path.name in words and "expected" in words and len(words) < 500
+        assert path.name in words and len(words) < 500
+        said, _, fix = words.rpartition("; ")
+        assert "expected" in said and "found" in said and fix
     assert hashes(tmp_path) == {name: hashlib.sha256(BAD[name]).hexdigest()}
+
+
+def test_what_is_not_kept_of_an_obj_is_said(tmp_path, capsys):
+    """A broken picture and colours of some vertices are no reason to refuse the shape."""
+    names = ("no_picture.obj", "some_colors.obj")
+    for path in written(tmp_path, {name: GOOD[name] for name in names}):
+        code, out, _ = run(capsys, "check", path)
+        assert code in (0, 1)
+        assert ("note: not read: no_picture.obj: expected a PNG" in out) == (path.name == names[0])
+        assert ("options of the picture: not kept" in out) == (path.name == names[0])
+        assert ("colors: not on every vertex, not read" in out) == (path.name == names[1])
+        assert " at 0x" not in out  # no object of ours is of interest
+
+
+def test_colors_of_an_obj_may_be_bytes(tmp_path):
+    for largest in (1.0, 255.0, 1.5):  # 1.5 is brighter than white, not a byte
+        path = tmp_path / "colors.obj"
+        path.write_text(f"v 0 0 0 {largest} 0 0\nv 1 0 0 0 0 0\nv 0 1 0 0 0 0\nf 1 2 3\n")
+        colors = read_mesh(path).colors
+        assert colors is not None
+        assert colors.max() == (1.5 if largest == 1.5 else 1.0)
+
+
+CUBE = dataclasses.replace(SAMPLES["cube"], name="a name of its own")
+REFUSED = {
+    "far": dataclasses.replace(CUBE, verts=CUBE.verts * 1e300),
+    "flat": dataclasses.replace(CUBE, verts=CUBE.verts * np.array([1, 0, 0])),
+    "points": dataclasses.replace(CUBE, faces=np.zeros((0, 3))),
+}
+WORDS = {
+    "far": ("coordinates up to 1e+75", "coordinates up to 1e+75", "coordinates up to 1e+75"),
+    "flat": ("of no or endless size", "a surface with area", "triangles with an area"),
+    "points": ("at least one triangle", "at least one triangle", "triangles with finite corners"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize(("place", "work"), [(0, "unwrap"), (1, "partition"), (2, "clean")])
+def test_errors_name_the_file_not_only_the_mesh(tmp_path, capsys, monkeypatch, name, place, work):
+    if work == "clean":
+        pytest.importorskip("pymeshlab")
+    monkeypatch.setenv("MONOPART_DEBUG", "1")
+    source = tmp_path / "in.npz"
+    write_mesh(source, REFUSED[name])
+    argv, target = WORK[work]
+    words = refused(capsys, *argv, source, "-o", tmp_path / target)
+    assert words.startswith(f"{source}: ") and WORDS[name][place] in words
 
 
 WORK = {
