@@ -65,9 +65,9 @@ REFUSED = {
     "flat": dataclasses.replace(CUBE, verts=CUBE.verts * np.array([1, 0, 0])),
     "points": dataclasses.replace(CUBE, faces=np.zeros((0, 3))),
 }
-WORDS = {
+WORDS = {  # nothing where the tool gives a result
     "far": ("coordinates up to 1e+75", "coordinates up to 1e+75", "coordinates up to 1e+75"),
-    "flat": ("of no or endless size", "a surface with area", "triangles with an area"),
+    "flat": ("", "a surface with area", "triangles with an area"),
     "points": ("at least one triangle", "at least one triangle", "triangles with finite corners"),
 }
 
@@ -81,6 +81,9 @@ def test_errors_name_the_file_not_only_the_mesh(tmp_path, capsys, monkeypatch, n
     source = tmp_path / "in.npz"
     write_mesh(source, REFUSED[name])
     argv, target = WORK[work]
+    if not WORDS[name][place]:
+        assert run(capsys, *argv, source, "-o", tmp_path / target)[0] == 0
+        return
     words = refused(capsys, *argv, source, "-o", tmp_path / target)
     assert words.startswith(f"{source}: ") and WORDS[name][place] in words
 
