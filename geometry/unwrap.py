@@ -19,6 +19,8 @@ GRID = 2.0**-24
 """Coordinates are whole multiples of this: exact in float32, so that tests of them are exact."""
 
 
+_LINE = 1e-14
+"""Area, in squares of the extent, below which a surface counts as a line."""
 _SIMPLE = 16 * np.pi
 """Total curvature up to which a mesh is a simple shape: four times that of a sphere."""
 
@@ -182,6 +184,20 @@ def _arrays(
     return points, corners, labels
 
 
+def _unit(corners: np.ndarray) -> float:
+    """The root of the area: a unit for every tolerance, whatever that of the input; 1 of a point.
+
+    Of a line it is far above the root of what rounding leaves of the area.
+    """
+    extent = float(np.ptp(corners, axis=(0, 1)).max())
+    if extent == 0:
+        return 1.0
+    span = 2.0 ** np.floor(np.log2(extent))  # changes no digit
+    side = (corners[:, 1:] - corners[:, :1]) / span
+    area = float(np.linalg.norm(np.cross(side[:, 0], side[:, 1]), axis=1).sum()) / 2
+    return float(np.sqrt(max(area, _LINE)) * span)
+
+
 def _layout(
     verts: np.ndarray,
     faces: np.ndarray,
@@ -196,11 +212,7 @@ def _layout(
     from .uv_seams import Surface
 
     tell = progress or (lambda stage, share: None)
-    # a unit of area for every tolerance, whatever the unit of the input
-    corners = verts[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = max(float(np.linalg.norm(cross, axis=1).sum()) / 2, 1e-300)
-    places = (verts - corners.mean((0, 1))) / np.sqrt(area)
+    places = (verts - verts[faces].mean((0, 1))) / _unit(verts[faces])
     tell("seams", 0.0)
     surface = Surface.of(places, faces, chosen["symmetric"])
     share = chosen["chart_share"]

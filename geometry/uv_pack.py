@@ -13,6 +13,8 @@ _COARSE, _FINE = ((96, 12), (64, 24)), 384
 """Cells of the coarse grids and turns that a chart may have on each; cells of the fine grid."""
 _GOOD = 0.65
 """Share of the square at which the second coarse grid is not tried."""
+_LONG = 1.5
+"""Length of the longest chart in sides of the grid, at most: more cells would not help."""
 _TRIALS = 18
 _WORKERS = 2
 _FREE, _MANY = 60, 150
@@ -202,8 +204,11 @@ class _Board:
         count: int,
         turns: np.ndarray | None = None,
     ) -> "_Board":
-        # the charts cover about seven tenths of the cells
-        unit = grid * np.sqrt(0.7 / max(float(sizes.sum()), 1e-300))
+        # the charts cover about seven tenths of the cells, or the longest spans them all and more
+        longest = max(float(np.hypot(*np.ptp(own, axis=(0, 1)))) for own in faces)
+        unit = grid * min(
+            np.sqrt(0.7 / max(float(sizes.sum()), 1e-300)), _LONG / max(longest, 1e-300)
+        )
         every = np.arange(count)
         small = every[:: max(1, count // 4)]
         few = sizes < 0.004 * sizes.sum()

@@ -12,6 +12,7 @@ from .uv_mesh import CutMesh, MeshEdges
 
 _VIEWS = 48
 _SHOWN = 3.0
+_CELLS = 4096  # of a depth map along the longest side, at most
 """How much dearer a seam is where the surface is seen from everywhere than where from nowhere."""
 
 
@@ -152,6 +153,7 @@ def openness(
     normal = np.divide(normal, size, out=np.zeros_like(normal), where=size > 0)
     points = np.concatenate([verts, corners.mean(1)])
     edge = np.sqrt(np.maximum(np.linalg.norm(cross, axis=1).mean(), 1e-60)) * 1.2
+    edge = max(edge, float(np.ptp(points, axis=0).max()) / _CELLS)  # needles, or no area at all
     seen, front = np.zeros(len(verts)), np.zeros(len(verts))
     for view in _directions(_VIEWS):
         towards = normal @ view

@@ -48,8 +48,9 @@ class GltfFile:
         self._buffers: dict[int, bytes] = {}
 
     def error(self, message: str) -> InputError:
-        """An error that names the file."""
-        return InputError(f"{self.path}: {message}")
+        """An error that names the file, and a fix where the message has none."""
+        fix = "" if ";" in message else "; export it again"
+        return InputError(f"{self.path}: {message}{fix}")
 
     def item(self, kind: str, index: int) -> dict[str, Any]:
         """An entry of one of the lists of the file.

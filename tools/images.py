@@ -21,14 +21,16 @@ def decoded(data: bytes, source: str) -> Float[np.ndarray, "H W 3"]:
     Raises:
         InputError: not a whole picture.
     """
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(io.BytesIO(data)) as image:
             pixels = np.asarray(image.convert("RGB"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        # Pillow's own words name an object in memory where it knows no such kind
+        text = "of no kind that is known" if isinstance(error, UnidentifiedImageError) else error
         raise InputError(
-            f"{source}: expected a PNG or JPEG picture, found {len(data)} other bytes ({error}); "
+            f"{source}: expected a PNG or JPEG picture, found {len(data)} other bytes ({text}); "
             "export it again"
         ) from error
     return pixels.astype(np.float64) / 255

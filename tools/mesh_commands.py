@@ -42,7 +42,25 @@ def run(arguments: argparse.Namespace) -> int:
         options = dataclasses.replace(options, out=None, report=out, picture=picture)
     # broken meshes hold NaN and infinity; they are reported, not warned of
     with progress_bar(command) as update, np.errstate(all="ignore"):
-        return COMMANDS[command](arguments, Job(command, options, update))
+        job = Job(command, options, update)
+        try:
+            return COMMANDS[command](arguments, job)
+        except InputError as error:
+            raise _of_file(error, job) from error
+
+
+def _of_file(error: InputError, job: Job) -> InputError:
+    """An error that names a file: that of a mesh which knows its own name only."""
+    text = str(error)
+    options = job.options
+    starts = [str(path) for path in (options.report, options.picture) if path is not None]
+    if options.out is not None:  # and what stands beside it
+        starts.append(f"{options.out.with_suffix('')}.")
+    named = any(str(path) in text for path in job.inputs)
+    if named or not job.inputs or text.startswith(("--", *starts)):
+        return error
+    names = ", ".join(map(str, job.inputs))
+    return InputError(f"{names}: {text.removeprefix(f'{job.inputs[-1].stem}: ')}")
 
 
 def convert(arguments: argparse.Namespace, job: Job) -> int:

@@ -32,7 +32,7 @@ def read(path: Path) -> Mesh:
     texture = arrays.get("texture")
     return Mesh(
         verts=verts,
-        faces=faces.astype(np.int64),
+        faces=faces,
         corner_uv=_corner_uv(arrays),
         weights=weights,
         skeleton=_skeleton(arrays, verts),

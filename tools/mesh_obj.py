@@ -1,6 +1,7 @@
 """Wavefront OBJ with its material and picture; vertex colours stand behind the position."""
 
 import io
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,11 @@ from monopart.geometry.errors import InputError
 from .images import decoded, encoded
 from .meshio import Mesh
 from .polygons import fan_corners, fan_notes
+
+_OPTIONS = re.compile(
+    r"(?:-(?:[ost](?:\s+[-+.\dEe]+){1,3}|mm(?:\s+\S+){2}|(?!(?:[ost]|mm)\s)[A-Za-z]+\s+\S+)\s+)*"
+)
+"""Options of a map, before the name of its picture."""
 
 
 class _Lines:
@@ -67,12 +73,15 @@ class _Lines:
         self.sizes.append(len(values))
 
     def index(self, word: str, count: int, number: int) -> int:
-        value = int(word)
+        try:
+            value = int(word)
+        except ValueError:
+            value = 0
         index = value - 1 if value > 0 else count + value
-        if value == 0 or index < 0:
+        if value == 0 or not 0 <= index < 2**53:
             raise InputError(
                 f"{self.path}: line {number}: expected an index from 1 or from -{count}, "
-                f"found {value}; correct the face"
+                f"found {word or 'nothing'}; correct the face"
             )
         return index
 
@@ -82,11 +91,17 @@ def read(path: Path) -> Mesh:
     lines = _Lines(path)
     data = path.read_bytes()
     if b"\0" in data:
-        raise InputError(f"{path}: expected text, found zero bytes; it is no OBJ or is damaged")
-    lines.read(data.decode("utf-8", "replace"))
+        raise InputError(
+            f"{path}: expected text, found zero bytes; it is damaged, of another "
+            "kind, or UTF-16: save it as OBJ in UTF-8"
+        )
+    lines.read(data.decode("utf-8-sig", "replace"))
     if not lines.verts:
-        raise InputError(f"{path}: expected lines of vertices (v x y z), found none; it is empty")
-    verts, colors = _positions(lines.verts, path)
+        raise InputError(
+            f"{path}: expected lines of vertices (v x y z), found none; it is empty or "
+            "no OBJ, export it again"
+        )
+    verts, colors, odd = _positions(lines.verts, path)
     sizes = np.array(lines.sizes, dtype=np.int64)
     fans, dropped = fan_corners(sizes)
     corners = np.array(lines.corners, dtype=np.int64).reshape(-1, 2)
@@ -101,18 +116,36 @@ def read(path: Path) -> Mesh:
         colors=colors,
         texture=texture,
         name=lines.name or path.stem,
-        notes=(*fan_notes(sizes, dropped), *notes, *more, *unknown),
+        notes=(*fan_notes(sizes, dropped), *odd, *notes, *more, *unknown),
     )
 
 
-def _positions(rows: list[list[str]], path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+def _positions(
+    rows: list[list[str]], path: Path
+) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
+    """Positions, colours, and what is not kept."""
     widths = {len(row) for row in rows}
-    if min(widths) < 3:
-        raise InputError(f"{path}: expected three numbers behind v, found {min(widths)}")
-    if min(widths) >= 6:
-        values = np.array([row[:6] for row in rows], dtype=object).astype(np.float64)
-        return values[:, :3], values[:, 3:]
-    return np.array([row[:3] for row in rows], dtype=object).astype(np.float64), None
+    if min(widths) < 6:
+        lost = ["colors: not on every vertex, not read"] if max(widths) >= 6 else []
+        return _numbers(rows, 3, "vertex", path), None, lost
+    values = _numbers(rows, 6, "vertex", path)
+    colors = values[:, 3:]
+    is_byte = (colors > 1).any() and (colors == np.rint(colors)).all()  # as some programs write
+    return values[:, :3], colors / 255 if is_byte else colors, []
+
+
+def _numbers(rows: list[list[str]], width: int, what: str, path: Path) -> np.ndarray:
+    """The first numbers of each row, (n, width)."""
+    values = []
+    for number, row in enumerate(rows, 1):
+        try:
+            values.append([float(row[column]) for column in range(width)])
+        except (ValueError, IndexError):
+            raise InputError(
+                f"{path}: {what} {number}: expected {width} numbers such as 0.5, found "
+                f"{' '.join(row)[:80] or 'none'}; correct it, or export it again"
+            ) from None
+    return np.array(values, dtype=np.float64).reshape(-1, width)
 
 
 def _uv(lines: _Lines, index: np.ndarray, path: Path) -> tuple[np.ndarray | None, list[str]]:
@@ -120,10 +153,11 @@ def _uv(lines: _Lines, index: np.ndarray, path: Path) -> tuple[np.ndarray | None
         return None, []
     if index.max() >= len(lines.uvs):
         raise InputError(
-            f"{path}: expected texture indices up to {len(lines.uvs)}, found {index.max() + 1}"
+            f"{path}: expected texture indices up to {len(lines.uvs)}, found {index.max() + 1}; "
+            "correct the faces"
         )
-    rows = [[*row, "0"][:2] for row in lines.uvs]
-    uv = np.array(rows, dtype=object).astype(np.float64)
+    rows = [[*row, "0"] if len(row) == 1 else row for row in lines.uvs]
+    uv = _numbers(rows, 2, "vt", path)
     missing = int((index < 0).any(axis=1).sum())
     notes = [f"texture coordinates: none on {missing} faces, set to 0"] if missing else []
     return np.where((index < 0)[..., None], 0.0, uv[np.maximum(index, 0)]), notes
@@ -137,14 +171,19 @@ def _texture(lines: _Lines, path: Path) -> tuple[np.ndarray | None, list[str]]:
         if not file.is_file():
             notes.append(f"{library}: the material file is missing")
             continue
-        names += _pictures(file.read_text("utf-8", "replace"))
-    pictures = list(dict.fromkeys(names))
+        names += _pictures(file.read_text("utf-8-sig", "replace"))
+    pictures = list(dict.fromkeys(_OPTIONS.sub("", name, count=1) for name in names))
+    if pictures and not set(pictures) & set(names):
+        notes.append("options of the picture: not kept")
     if len(pictures) != 1:
         return None, notes + ([f"textures: {len(pictures)} pictures, not read"] if pictures else [])
     file = path.parent / pictures[0].replace("\\", "/")
     if not file.is_file():
         return None, [*notes, f"{pictures[0]}: the picture is missing"]
-    return decoded(file.read_bytes(), str(file)), notes
+    try:
+        return decoded(file.read_bytes(), pictures[0]), notes
+    except InputError as error:  # the shape is whole, and many tools need no picture
+        return None, [*notes, f"not read: {error}"]
 
 
 def _pictures(text: str) -> list[str]:

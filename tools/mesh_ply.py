@@ -29,7 +29,10 @@ def read(path: Path) -> Mesh:
     file = parse_ply(path.read_bytes(), path)
     vertex = file.elements.get("vertex")
     if vertex is None or not {"x", "y", "z"} <= set(vertex):
-        raise InputError(f"{path}: expected the element vertex with x, y and z, found none of it")
+        raise InputError(
+            f"{path}: expected the element vertex with x, y and z, found none of it; "
+            "export it with positions"
+        )
     verts = np.stack([_numbers(vertex, axis) for axis in "xyz"], axis=1)
     faces, corner_uv, notes = _faces(file, path)
     if corner_uv is None:
@@ -66,7 +69,7 @@ def _faces(file: PlyFile, path: Path) -> tuple[np.ndarray, np.ndarray | None, tu
             )
         return np.zeros((0, 3), dtype=np.int64), None, ()
     corners, dropped = fan_corners(lists.sizes)
-    faces = lists.values.astype(np.int64)[corners]
+    faces = lists.values[corners]
     uv, coordinates = None, element.get("texcoord")
     if isinstance(coordinates, Lists) and np.array_equal(coordinates.sizes, 2 * lists.sizes):
         uv = coordinates.values.astype(np.float64).reshape(-1, 2)[corners]

@@ -25,15 +25,24 @@ def read(path: Path) -> Mesh:
         corners = np.frombuffer(data, _RECORD, count, _HEADER)["corners"].astype(np.float64)
     elif data.lstrip()[:5].lower() == b"solid":
         if b"endsolid" not in data.lower():
-            raise InputError(f"{path}: expected 'endsolid' at its end, found none; it is cut short")
+            raise InputError(
+                f"{path}: expected 'endsolid' at its end, found none; it is cut short, "
+                "copy or export it again"
+            )
         found = _VERTEX.findall(data)
+        if len(found) % 3:
+            raise InputError(
+                f"{path}: expected three vertices a triangle, found {len(found)} vertices in all; "
+                "it is damaged, export it again"
+            )
         corners = np.array(found, dtype=object).astype(np.float64).reshape(-1, 3, 3)
         title = data.lstrip()[5:].split(b"\n", 1)[0].decode("utf-8", "replace").strip()
         name = title or name
     else:
+        size = "at least 84" if count < 0 else f"{expected} (its count says {count} triangles)"
         raise InputError(
-            f"{path}: expected {expected if count >= 0 else 'at least 84'} bytes of a binary STL "
-            f"or 'solid', found {len(data)} bytes; it is cut short or no STL"
+            f"{path}: expected a text that begins with 'solid', or a binary STL of {size} bytes, "
+            f"found {len(data)} bytes; it is cut short, damaged or no STL: export it again"
         )
     verts, inverse = np.unique(corners.reshape(-1, 3) + 0.0, axis=0, return_inverse=True)
     order, faces = _first_seen(inverse.reshape(-1))

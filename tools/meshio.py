@@ -17,8 +17,13 @@ from jaxtyping import Float
 from monopart.geometry.atomic import replacing
 from monopart.geometry.errors import InputError
 
+from .mesh_kinds import refuse_other_kinds
+
 WEIGHTS_SUM = 1e-3
 """Rows of weights may differ by this much from a sum of 1 before a writer refuses them."""
+
+LARGEST = 1e75
+"""Largest coordinate with which tools compute: squares of areas must stay within float64."""
 
 _DAMAGE = (
     *(ValueError, KeyError, IndexError, TypeError, OverflowError, EOFError, MemoryError),
@@ -93,7 +98,7 @@ class Mesh:
         faces = np.asarray(self.faces)
         if faces.size == 0:  # a point cloud, whatever the shape of nothing
             faces = np.zeros((0, 3), dtype=np.int64)
-        object.__setattr__(self, "faces", faces.astype(np.int64))
+        object.__setattr__(self, "faces", self._whole(faces))
         verts, count = len(self.verts), len(self.faces)
         wanted = {
             "verts": (verts, 3),
@@ -116,6 +121,17 @@ class Mesh:
                 f"{self.name}: skeleton: expected {joints} joints (those of the weights), found "
                 f"{len(self.skeleton.parents)}; give one joint per column of weights"
             )
+
+    def _whole(self, faces: np.ndarray) -> np.ndarray:
+        """Vertex numbers as int64; some files hold them as floats."""
+        if faces.dtype.kind == "f":
+            whole = (faces == np.rint(faces)) & (np.abs(faces) < 2**53)
+            if not whole.all():
+                raise InputError(
+                    f"{self.name}: faces: expected whole vertex numbers, found "
+                    f"{faces[~whole][0]:g}; correct the faces"
+                )
+        return faces.astype(np.int64)
 
     def _check_shape(self, field: str, shape: tuple[int | None, ...]) -> None:
         value = getattr(self, field)
@@ -157,6 +173,12 @@ class Mesh:
             raise InputError(
                 f"{self.name}: vertices: expected finite numbers, found {bad} of {self.num_verts} "
                 "with NaN or infinity; clean the mesh first (monopart-mesh remesh --clean)"
+            )
+        far = np.abs(self.verts).max(initial=0.0)
+        if far > LARGEST:
+            raise InputError(
+                f"{self.name}: vertices: expected coordinates up to {LARGEST:g}, found {far:g}; "
+                "their areas overflow, choose a larger unit"
             )
         if faces and not self.num_faces:
             raise InputError(
@@ -241,6 +263,7 @@ def read_mesh(path: str | os.PathLike[str]) -> Mesh:
         found = "a folder" if source.is_dir() else "nothing"
         raise InputError(f"{source}: expected a mesh file, found {found}; check the path")
     with refused(source), np.errstate(all="ignore"):  # damaged numbers are looked at afterwards
+        refuse_other_kinds(source)
         return _room(kind).read(source)
 
 
@@ -346,7 +369,8 @@ def refused(source: Path) -> Iterator[None]:
         text = str(error)
         if str(source) in text:
             raise
-        raise InputError(f"{source}: {text}") from error
+        # a mesh without a name of its own is named after its file
+        raise InputError(f"{source}: {text.removeprefix(f'{source.stem}: ')}") from error
     except (*_DAMAGE, OSError) as error:
         raise InputError(
             f"{source}: expected a whole, valid {source.suffix} file, found damage "

@@ -1,5 +1,6 @@
 """The elements of a PLY file as arrays, text or binary of either byte order."""
 
+import codecs
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,30 +76,39 @@ def parse_ply(data: bytes, source: Path) -> PlyFile:
 
 
 def _header(data: bytes, source: Path) -> tuple[str, list[_Element], list[str], bytes]:
+    data = data.removeprefix(codecs.BOM_UTF8)
     end = data.find(b"end_header")
     if not data.startswith(b"ply") or end < 0:
         raise InputError(
-            f"{source}: expected a header from 'ply' to 'end_header', found none; it is no PLY"
+            f"{source}: expected a header from 'ply' to 'end_header', found none; export it as PLY"
         )
-    start = data.find(b"\n", end) + 1
+    newline = b"\n" if b"\n" in data[:end] else b"\r"  # as programs of old Macintoshes wrote
+    start = data.find(newline, end) + 1
     if start == 0:
         start = len(data)
     lines = data[:end].decode("utf-8", "replace").splitlines()
     layout, elements, comments = "", [], []
     for line in lines[1:]:
-        words = line.split()
-        if not words:
-            continue
-        if words[0] == "format":
-            layout = words[1]
-        elif words[0] == "comment":
-            comments.append(line.strip()[len("comment ") :])
-        elif words[0] == "element":
-            elements.append(_Element(words[1], int(words[2]), []))
-        elif words[0] == "property":
-            elements[-1].properties.append(_property(words, source))
+        words = line.split() or [""]
+        try:
+            if words[0] == "format":
+                layout = words[1]
+            elif words[0] == "comment":
+                comments.append(line.strip()[len("comment ") :])
+            elif words[0] == "element":
+                elements.append(_Element(words[1], int(words[2]), []))
+            elif words[0] == "property":
+                elements[-1].properties.append(_property(words, source))
+        except (IndexError, ValueError):
+            raise InputError(
+                f"{source}: header: expected lines such as 'element vertex 8' and then 'property "
+                f"float x', found {line[:80]!r}; export it again"
+            ) from None
     if layout not in ("ascii", "binary_little_endian", "binary_big_endian"):
-        raise InputError(f"{source}: format: expected ascii or binary, found {layout!r}")
+        raise InputError(
+            f"{source}: format: expected ascii, binary_little_endian or "
+            f"binary_big_endian, found {layout or 'none'}; export it again"
+        )
     return layout, elements, comments, data[start:]
 
 
@@ -106,7 +116,10 @@ def _property(words: list[str], source: Path) -> _Property:
     types = words[2:4] if words[1] == "list" else words[1:2]
     unknown = [name for name in types if name not in _TYPES]
     if unknown:
-        raise InputError(f"{source}: property: expected a number type, found {unknown[0]!r}")
+        raise InputError(
+            f"{source}: property: expected a number type such as float, "
+            f"found {unknown[0]!r}; export it again"
+        )
     if words[1] == "list":
         return _Property(words[4], _TYPES[words[3]], _TYPES[words[2]])
     return _Property(words[2], _TYPES[words[1]], None)
@@ -139,7 +152,7 @@ class _Reader:
     def short(self, element: _Element) -> InputError:
         return InputError(
             f"{self.source}: {element.name}: expected {element.count} rows, found the end of the "
-            "file; it is cut short"
+            "file; it is cut short, copy or export it again"
         )
 
     def left(self) -> int:

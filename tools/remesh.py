@@ -116,14 +116,20 @@ def clean(mesh: Mesh, close_holes: int = 0, progress: Progress = _silent) -> Rem
     finite, removed = without_broken(mesh)
     if not finite.num_faces:
         raise InputError(
-            f"{mesh.name}: expected triangles with finite corners, found none; there is nothing "
-            "to mend"
+            f"{mesh.name}: expected triangles with finite corners and weights, found none; there "
+            "is nothing to mend"
         )
+    finite.require()
 
     def work(meshes: Any, size: float) -> None:
         meshes.meshing_remove_duplicate_vertices()
         meshes.meshing_remove_duplicate_faces()
         meshes.meshing_remove_null_faces()
+        if not meshes.current_mesh().face_number():
+            raise InputError(
+                f"{mesh.name}: expected triangles with an area, found none; there is nothing to "
+                "mend"
+            )
         meshes.meshing_repair_non_manifold_edges()
         meshes.meshing_repair_non_manifold_vertices()
         meshes.meshing_remove_unreferenced_vertices()
@@ -192,8 +198,8 @@ def _remeshed(
         faces = np.asarray(result.face_matrix(), dtype=np.int64).reshape(-1, 3)
     except lab.PyMeshLabException as error:
         raise InputError(
-            f"{mesh.name}: expected a surface that PyMeshLab can {method}, found one that it "
-            f"refuses ({error}); clean it first"
+            f"{mesh.name}: expected a surface on which PyMeshLab can do this, found one that it "
+            f"refuses ({error}); look at it with monopart-mesh check, and clean it"
         ) from error
     if not len(faces) or not np.isfinite(verts).all():
         raise InputError(

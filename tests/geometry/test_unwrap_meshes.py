@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from monopart.geometry import uv_pack
 from monopart.geometry.body import BodyModel
 from monopart.geometry.parts import PartMap
 from monopart.geometry.unwrap import UVLayout, unwrap
@@ -148,3 +149,24 @@ def test_discs_of_a_mesh_whose_faces_squared_exceed_32_bits() -> None:
     seams = cut_to_discs(surface, ~surface.edges.joinable)
     assert CutMesh.of(surface.edges, seams).euler.tolist() == [1]
     assert int((seams & surface.edges.joinable).sum()) <= 3000
+
+
+@pytest.mark.parametrize("thin", [1e-2, 1e-6])
+def test_needles_cost_no_more_than_other_meshes(thin: float) -> None:
+    """A chart a hundred times as long as wide took minutes, and one of 1e8 all the memory."""
+    verts, faces = igl.icosahedron()
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    layout = unwrap(torch.tensor(verts * [1, thin, thin] @ turn), torch.tensor(faces).long())
+    _sound(layout)
+    assert layout.report.symmetric_dirichlet <= 4.03
+    strip = np.array([[[0, 0], [1, 0], [1, thin]], [[0, 0], [1, thin], [0, thin]]])
+    for grid in (96, 384):
+        board = uv_pack._Board.of([strip], np.array([thin]), grid, 1.0, 12)
+        assert board.canvas <= 2 * grid
+
+
+@pytest.mark.parametrize("axes", [(1, 0, 0), (1, 2, 3), (0, 0, 0)])
+def test_a_line_and_a_point_come_without_flips(axes: tuple[int, int, int]) -> None:
+    """Rounding leaves a line an area of nearly nothing, which is no unit to measure by."""
+    verts, faces = igl.icosahedron()
+    _sound(unwrap(torch.tensor(verts[:, :1] * np.array([axes])), torch.tensor(faces).long()))

@@ -49,6 +49,11 @@ def _binary_ply(order: str) -> bytes:
     return head.encode() + body
 
 
+def _mac_ply() -> bytes:
+    head, body = _binary_ply("<").split(b"end_header\r\n")
+    return head.replace(b"\r\n", b"\r") + b"end_header\r" + body
+
+
 def _stl(count: int, said: int | None = None) -> bytes:
     rng = np.random.default_rng(count)
     rows = b"".join(struct.pack("<12fH", 0, 0, 1, *rng.random(9).tolist(), 0) for _ in range(count))
@@ -74,6 +79,14 @@ def good_files() -> dict[str, bytes]:
         + b"f 1 2 3 4 5 6 7\n",
         "no_material.obj": ("mtllib gone.mtl\nusemtl x\n" + TRIANGLE + "f 1 2 3\n").encode(),
         "latin.obj": b"# caf\xe9\no caf\xe9\n" + TRIANGLE.encode() + b"f 1 2 3\n",
+        "bom.obj": b"\xef\xbb\xbf" + TRIANGLE.encode() + b"f 1 2 3\n",
+        "mac.obj": (TRIANGLE + "f 1 2 3\n").replace("\n", "\r").encode(),
+        "no_picture.obj": (
+            "mtllib no_picture.obj\n# map_Kd lies in no comment\nmap_Kd -s 1 1 no_picture.obj\n"
+            + TRIANGLE
+            + "vt 0 0\nf 1/1 2/1 3/1\n"
+        ).encode(),
+        "some_colors.obj": b"v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0 0 1 0\nf 1 2 3\n",
         "homogeneous.obj": b"v 0 0 0 1\nv 1 0 0 1\nv 0 1 0 1\nf 1 2 3\nl 1 2\np 3\n",
         "half_textured.obj": (
             TRIANGLE + "vt 0 0\nvt 1 0 0\nvt 0 1\nf 1/1 2/2 3/3\nf 3 2 1\n"
@@ -84,6 +97,9 @@ def good_files() -> dict[str, bytes]:
         "many.ply": PLY.encode(),
         "little.ply": _binary_ply("<"),
         "big.ply": _binary_ply(">"),
+        "bom.ply": b"\xef\xbb\xbf" + PLY.encode(),
+        "mac.ply": PLY.replace("\n", "\r").encode(),
+        "mac_binary.ply": _mac_ply(),
         "binary.stl": _stl(20),
         "nothing.stl": _stl(0),
         "text.stl": b"SOLID x\n FACET NORMAL 0 0 1\n outer loop\n  VERTEX 0 0 0\n  vertex 1e0 0 0\n"
@@ -91,6 +107,7 @@ def good_files() -> dict[str, bytes]:
         "two_solids.stl": b"solid a\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendsolid a\n"
         b"solid b\nvertex 0 0 1\nvertex 1 0 1\nvertex 0 1 1\nendsolid b\n",
         "plain.npz": _npz(vertices=np.eye(3), faces=np.array([[0, 1, 2]])),
+        "floats.npz": _npz(vertices=np.eye(3), faces=np.array([[0.0, 1.0, 2.0]])),
         "half.npz": _npz(v_template=np.eye(3, dtype=np.float16), f=np.array([[0, 1, 2]], "u4")),
     }
 
@@ -99,6 +116,22 @@ def bad_files() -> dict[str, bytes]:
     """Files that must be refused in one line."""
     return {
         "empty.obj": b"",
+        "utf16.obj": (TRIANGLE + "f 1 2 3\n").encode("utf-16"),
+        "utf16_bare.obj": (TRIANGLE + "f 1 2 3\n").encode("utf-16-be"),
+        "utf16.ply": PLY.encode("utf-16"),
+        "page.obj": b"<!DOCTYPE html>\n<html>404</html>",
+        "page.stl": b"<html>".ljust(200),
+        "pointer.glb": b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n",
+        "is_ply.obj": PLY.encode(),
+        "is_glb.ply": struct.pack("<4sII", b"glTF", 2, 12),
+        "is_zip.stl": _npz(v_template=np.eye(3)),
+        "comma.obj": TRIANGLE.replace("0 1 0", "0,5 1,0 0,0").encode(),
+        "letters.obj": (TRIANGLE + "f a b c\n").encode(),
+        "slashes.obj": (TRIANGLE + "f / / /\n").encode(),
+        "huge_index.obj": (TRIANGLE + "f 1 2 99999999999999999999\n").encode(),
+        "empty_vt.obj": (TRIANGLE + "vt\nf 1/1 2/1 3/1\n").encode(),
+        "words_vt.obj": (TRIANGLE + "vt a b\nf 1/1 2/1 3/1\n").encode(),
+        "beyond_vt.obj": (TRIANGLE + "vt 0 0\nf 1/1 2/1 3/2\n").encode(),
         "words.obj": b"v a b c\nf 1 2 3\n",
         "two_numbers.obj": b"v 0 0\n",
         "beyond.obj": (TRIANGLE + "f 1 2 4\n").encode(),
@@ -106,6 +139,15 @@ def bad_files() -> dict[str, bytes]:
         "before.obj": (TRIANGLE + "f -4 -2 -1\n").encode(),
         "fraction.obj": (TRIANGLE + "f 1.5 2 3\n").encode(),
         "no_header.ply": b"ply\nformat ascii 1.0\n",
+        "empty.ply": b"",
+        "element.ply": PLY.replace("vertex 4", "vertex").encode(),
+        "count.ply": PLY.replace("vertex 4", "vertex four").encode(),
+        "property.ply": PLY.replace("float x", "float").encode(),
+        "orphan.ply": PLY.replace("element vertex 4\n", "").encode(),
+        "no_format.ply": PLY.replace("format ascii 1.0\n", "").encode(),
+        "swapped.ply": _binary_ply("<").replace(b"binary_little", b"binary_big"),
+        "fraction.ply": PLY.replace("4 0 1 2 3 7", "4 0 1.5 2 3 7").encode(),
+        "nan_index.ply": PLY.replace("4 0 1 2 3 7", "4 0 nan 2 3 7").encode(),
         "short.ply": PLY.encode()[:-30],
         "unknown_type.ply": PLY.replace("float x", "quad x").encode(),
         "huge_count.ply": PLY.replace("vertex 4", "vertex 99999999999").encode(),
@@ -113,6 +155,8 @@ def bad_files() -> dict[str, bytes]:
         "no_positions.ply": PLY.replace("property float x", "property float q").encode(),
         "beyond.ply": PLY.replace("4 0 1 2 3 7", "4 0 1 2 9 7").encode(),
         "cut.ply": _binary_ply("<")[:-3],
+        "empty.stl": b"",
+        "longer.stl": _stl(5) + b"more",
         "count.stl": _stl(5, said=6),
         "huge.stl": _stl(5, said=2**32 - 1),
         "not_ended.stl": b"solid x\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n",
@@ -126,6 +170,8 @@ def bad_files() -> dict[str, bytes]:
         "list.gltf": b"[]",
         "bare.gltf": b'{"asset": {"version": "2.0"}}',
         "deep.gltf": b"[" * 100000,
+        "empty.npz": b"",
+        "fraction.npz": _npz(v_template=np.eye(3), f=np.array([[0, 1, 1.5]])),
         "names.npz": _npz(x=np.eye(3)),
         "shape.npz": _npz(v_template=np.eye(4), f=np.array([[0, 1, 2]])),
         "words.npz": _npz(v_template=np.array(["a"]), f=np.array([[0, 1, 2]])),

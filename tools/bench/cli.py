@@ -56,6 +56,7 @@ def parser() -> argparse.ArgumentParser:
         command.add_argument("--threads", type=int, metavar="N", help="threads of torch and Warp")
         command.add_argument("--markdown", action="store_true", help="print Markdown, not a table")
     _stability_arguments(commands)
+    _meshes_arguments(commands)
     compare = commands.add_parser("compare", help="two reports side by side")
     compare.add_argument("a", type=Path, metavar="A.json")
     compare.add_argument("b", type=Path, metavar="B.json")
@@ -69,6 +70,18 @@ def parser() -> argparse.ArgumentParser:
     publish.add_argument("reports", type=Path, nargs="*", metavar="REPORT.json")
     publish.add_argument("--into", type=Path, default=Path("docs/benchmarks.md"), metavar="PAGE")
     return root
+
+
+def _meshes_arguments(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    text = "monopart-mesh on the meshes in folders: results or clear errors, inputs left alone"
+    command = commands.add_parser("meshes", help=text, description=text)
+    command.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
+    text = "size of the largest file (default: 700)"
+    command.add_argument("--largest", type=int, default=700, metavar="KB", help=text)
+    text = "meshes of a folder, spread over their sizes (default: 8)"
+    command.add_argument("--each", type=int, default=8, metavar="N", help=text)
+    command.add_argument("--out", type=Path, default=Path("runs/bench"), metavar="DIR")
+    command.add_argument("--into", type=Path, metavar="PAGE", help="write the table into it")
 
 
 def _training_arguments(command: argparse.ArgumentParser) -> None:
@@ -124,6 +137,10 @@ def _run(arguments: argparse.Namespace) -> None:
         from .publish import publish
 
         print(", ".join(publish(arguments.reports, arguments.into)))
+    elif arguments.command == "meshes":
+        from .foreign import write
+
+        write(arguments)
     elif arguments.command == "stability":
         from .stability_page import command
 

@@ -50,6 +50,29 @@ def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [*lines, *("| " + " | ".join(row) + " |" for row in rows), ""]
 
 
+def write_section(page: Path, name: str, text: str) -> None:
+    """Put a text into a page, between the marks of a suite.
+
+    Args:
+        page: a Markdown file with the marks.
+        name: of the suite.
+        text: what goes between them.
+
+    Raises:
+        InputError: no such page, or no marks.
+    """
+    try:
+        whole = page.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{page}: expected a Markdown page, found {error.strerror}") from None
+    begin, end = BEGIN.format(name), END.format(name)
+    if begin not in whole or end not in whole:
+        raise InputError(f"{page}: expected the marks {begin} and {end}; add them where it goes")
+    before, rest = whole.split(begin, 1)
+    after = rest.split(end, 1)[1]
+    page.write_text(f"{before}{begin}\n{text}{end}{after}", encoding="utf-8")
+
+
 def _compared(table: Table, summaries: list[Summary]) -> list[str]:
     """All figures, at the size on which most was measured; of growth, none."""
     if table.error == "none":

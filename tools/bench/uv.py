@@ -12,7 +12,7 @@ from monopart.geometry.uv_mesh import MeshEdges
 from monopart.geometry.uv_mirror import seam_symmetry
 from monopart.geometry.uv_seams import Surface
 
-from .publish import BEGIN, END, grid
+from .publish import grid, write_section
 from .registry import Method, Operation, Problem, Settings
 from .results import Report, Row
 from .show import machine_line
@@ -151,13 +151,4 @@ def write_page(report: Report, page: Path) -> None:
     """
     if report.quick:
         raise InputError(f"{page}: expected measurements, found a --quick run; run it in full")
-    try:
-        text = page.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{page}: expected a Markdown page, found {error.strerror}") from None
-    begin, end = BEGIN.format("uv"), END.format("uv")
-    if begin not in text or end not in text:
-        raise InputError(f"{page}: expected the marks {begin} and {end}; add them where it goes")
-    before, rest = text.split(begin, 1)
-    after = rest.split(end, 1)[1]
-    page.write_text(f"{before}{begin}\n{tables(report)}{end}{after}", encoding="utf-8")
+    write_section(page, "uv", tables(report))
