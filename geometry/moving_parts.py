@@ -111,7 +111,6 @@ class MovingParts(PosedParts):
         rotation, translation = posed.rotation, posed.translation
         moving.rotation = rotation.detach().to(moving.verts)
         moving.translation = translation.detach().to(moving.verts)
-        moving.__dict__.pop("_vertex_normals", None)  # those of the other poses
         moving.turn = rotation.mT @ rotation.detach()
         moved = (translation.detach() - translation)[..., None]
         moving.shift = (rotation.mT @ moved).squeeze(-1)

@@ -7,13 +7,11 @@ differentiable, in its points.
 """
 
 import copy
-import functools
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn import functional
 
 from .body import BodyModel, PosedBody
 from .culling import BodyShell, ShellSamples
@@ -208,28 +206,44 @@ class PosedParts:
         launch(unskin_pairs, count, args, samples.points)
         return RestPoints(points, uv, valid)
 
-    @functools.cached_property
-    def _vertex_normals(self) -> Tensor:
-        """Of all bodies, in the world, [B V, 3]."""
-        normals = vertex_normals(self.verts, self.faces)
-        return (normals @ self.rotation.mT).reshape(-1, 3)
+    def world_normals(self) -> Float[Tensor, "b v 3"]:
+        """Which way the surface looks at the vertices, in the world.
 
-    def world_normals(
-        self, body: Int[Tensor, "m"], face: Int[Tensor, "m"], bary: Float[Tensor, "m 2"]
-    ) -> Float[Tensor, "m 3"]:
-        """Which way the surface looks, in the world: vertex normals, interpolated.
+        Returns:
+            Unit normals that point outside, zero for a vertex without area; constants.
+        """
+        return vertex_normals(self.verts, self.faces) @ self.rotation.mT
+
+    def interpolate(
+        self,
+        values: Float[Tensor, "b v c"],
+        body: Int[Tensor, "m"],
+        face: Int[Tensor, "m"],
+        bary: Float[Tensor, "m 2"],
+    ) -> Float[Tensor, "m c"]:
+        """Values of vertices on points of the surface.
 
         Args:
+            values: of the vertices of all bodies; no gradient.
             body: body of each point.
             face: face on which it lies, an index into the faces of the body.
             bary: first two barycentrics on it.
 
         Returns:
-            Unit normals that point outside, zero where those of the corners cancel; constants.
+            Their means, weighted by the barycentrics; constants.
         """
-        corners = self.faces[face] + body[:, None] * self.verts.shape[1]
-        normal = (self._vertex_normals[corners] * full_bary(bary)[..., None]).sum(1)
-        return functional.normalize(normal, dim=-1)
+        table = values.detach().flatten(0, 1)
+        if table.dtype == torch.float32 and table.shape[1] % 4 == 0:
+            from .kernels.closest import interpolate_rows
+            from .kernels.launch import launch, view
+
+            out = table.new_empty(len(face), table.shape[1])
+            args = [view(table.contiguous().unflatten(1, (-1, 4)), 4), view(body), view(face)]
+            args += [view(bary.contiguous(), 2), view(self.trees.corners, 3), values.shape[1]]
+            launch(interpolate_rows, len(face), [*args, view(out.unflatten(1, (-1, 4)), 4)], out)
+            return out
+        corners = self.faces[face] + body[:, None] * values.shape[1]
+        return (table[corners] * full_bary(bary).to(table)[..., None]).sum(1)
 
     def on_part(
         self, points: Float[Tensor, "m 3"], part: Int[Tensor, "m"], reach: float = 0.2

@@ -1,5 +1,6 @@
 """How light falls on a sample, as far as the training cameras can tell (beyond the paper)."""
 
+import weakref
 from collections.abc import Sequence
 
 import torch
@@ -31,6 +32,7 @@ class Light(torch.nn.Module):
             cameras: the training cameras.
         """
         super().__init__()
+        self._known: tuple[weakref.ref[PosedParts], Tensor] | None = None
         self.register_buffer("eyes", torch.stack([c.center for c in cameras]), persistent=False)
         self.register_buffer("axes", cameras[0].R.clone(), persistent=False)
 
@@ -53,12 +55,21 @@ class Light(torch.nn.Module):
             rows: [N] which of them.
             code: [N, C] their feature; None: they have none.
         """
-        normals = bodies.world_normals(body, pairs.face[rows], pairs.bary[rows])
+        light = bodies.interpolate(self._table(bodies), body, pairs.face[rows], pairs.bary[rows])
+        if lit is not None:
+            light = light * lit[body, None]
+        return light if code is None else torch.cat([code, light], -1)
+
+    @torch.no_grad()
+    def _table(self, bodies: PosedParts) -> Tensor:
+        """Light at the vertices, [B, V, 8]; made once for bodies that are asked again."""
+        if self._known is not None and self._known[0]() is bodies:
+            return self._known[1]
+        normals = bodies.world_normals()
         towards = functional.normalize(self.eyes - bodies.translation[:, None], dim=-1)
-        facing = (normals[:, None] * towards[body]).sum(-1).amax(1)
+        facing = (normals @ towards.mT).amax(-1)
         seen = ((facing + GRAZING) / (2 * GRAZING)).clamp(0.0, 1.0)
         share = seen * seen * (3 - 2 * seen)
-        if lit is not None:
-            share = share * lit[body]
-        light = irradiance_basis(normals @ self.axes.mT) * share[:, None]
-        return light if code is None else torch.cat([code, light], -1)
+        table = irradiance_basis(normals @ self.axes.mT) * share[..., None]
+        self._known = weakref.ref(bodies), table
+        return table

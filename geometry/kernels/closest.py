@@ -109,3 +109,25 @@ def unskin_pairs(
     )
     uv[i] = corner_uv[f, 0] * w[0] + corner_uv[f, 1] * w[1] + corner_uv[f, 2] * w[2]
     valid[i] = ok
+
+
+@no_type_check
+@wp.kernel
+def interpolate_rows(
+    start: int,
+    table: wp.array2d(dtype=wp.vec4),
+    body: wp.array(dtype=wp.int64),
+    face: wp.array(dtype=wp.int64),
+    bary: wp.array(dtype=wp.vec2),
+    faces: wp.array(dtype=wp.vec3i),
+    num_verts: int,
+    out: wp.array2d(dtype=wp.vec4),
+):
+    """Values of the vertices of many bodies, four numbers at a time, on points of their faces."""
+    i = start + wp.tid()
+    w = bary[i]
+    tri = faces[int(face[i])]
+    base = int(body[i]) * num_verts
+    corners = wp.vec3i(tri[0] + base, tri[1] + base, tri[2] + base)
+    for k in range(out.shape[1]):
+        out[i, k] = blended(table, k, corners, wp.vec3(w[0], w[1], 1.0 - w[0] - w[1]))

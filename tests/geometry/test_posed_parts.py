@@ -283,16 +283,33 @@ def test_world_normals_turn_with_the_body() -> None:
     pose.rotation[:] = torch.tensor([[0.0, 0, 0], [0.0, 1.2, 0.3], [-0.7, 0.2, 2.0]])
     posed = BODY(pose)
     parts = PosedParts(BODY, posed, CANONICAL, PARTS, RADIUS)
-    face = torch.arange(0, len(BODY.faces), 7)
-    bary = torch.full((len(face), 2), 1 / 3)
-    corners = posed.verts_world[:, BODY.faces[face]]
+    normals = parts.world_normals()
+    torch.testing.assert_close(normals.norm(dim=-1), torch.ones(normals.shape[:2]))
+    corners = posed.verts_world[:, BODY.faces]
     flat = torch.linalg.cross(
         corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
     )
     flat = torch.nn.functional.normalize(flat, dim=-1)
+    face = torch.arange(0, len(BODY.faces), 7)
     for body in range(3):
-        found = parts.world_normals(torch.full_like(face, body), face, bary)
-        torch.testing.assert_close(found.norm(dim=-1), torch.ones(len(face)))
+        middle = torch.full((len(face), 2), 1 / 3)
+        found = parts.interpolate(normals, torch.full_like(face, body), face, middle)
         # the middle of a face looks where the face looks, but for the bend of the surface
-        assert float((found * flat[body]).sum(-1).quantile(0.1)) > 0.9
-    assert parts.world_normals(face[:0], face[:0], bary[:0]).shape == (0, 3)
+        assert float((found * flat[body, face]).sum(-1).quantile(0.1)) > 0.85
+
+
+@pytest.mark.parametrize("columns", [1, 3, 4, 8])
+def test_values_of_vertices_are_mixed_on_faces(columns: int) -> None:
+    parts = PosedParts(BODY, BODY(poses()), CANONICAL, PARTS, RADIUS)
+    generator = torch.Generator().manual_seed(2)
+    values = torch.randn(3, BODY.num_verts, columns, generator=generator)
+    body = torch.randint(3, (2000,), generator=generator)
+    face = torch.randint(len(BODY.faces), (2000,), generator=generator)
+    three = torch.rand(2000, 3, generator=generator)
+    three = three / three.sum(1, keepdim=True)
+    found = parts.interpolate(values, body, face, three[:, :2])
+    exact = torch.einsum("mc,mcf->mf", three, values[body[:, None], BODY.faces[face]])
+    torch.testing.assert_close(found, exact, atol=2e-6, rtol=1e-5)
+    double = parts.interpolate(values.double(), body, face, three[:, :2])
+    torch.testing.assert_close(found, double.float(), atol=2e-6, rtol=1e-5)
+    assert parts.interpolate(values, body[:0], face[:0], three[:0, :2]).shape == (0, columns)

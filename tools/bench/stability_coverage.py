@@ -62,6 +62,7 @@ COVERED: dict[str, str] = {
     "PosedParts.on_part": "on_part",
     "PosedParts.reskin": "reskin",
     "PosedParts.world_normals": "world_normals",
+    "PosedParts.interpolate": "world_normals",
     "MovingParts.follow": "follow",
     "MovingParts.like": "follow",
     "PartMap.vertex_parts": "part_map",
