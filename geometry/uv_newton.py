@@ -68,7 +68,7 @@ class NewtonSolver:
         # the entries of the first column of all blocks of a column come before those of the second
         at = start[:, None, None] + two[:, None] + (2 * size[col])[:, None, None] * two
         self._slot = at[of_face.reshape(-1, 3, 3)].transpose(0, 1, 3, 2, 4).reshape(-1)
-        self._indices = np.empty(4 * len(block), np.int32)
+        self._indices = np.zeros(4 * len(block), np.int32)
         self._indices[at] = (2 * row[:, None] + two)[:, :, None]
         ends = np.stack([4 * first[:-1], 4 * first[:-1] + 2 * size], 1).reshape(-1)
         self._indptr = np.append(ends, 4 * len(block)).astype(np.int32)
