@@ -172,9 +172,11 @@ def image_vertices(
     image = cut.faces.reshape(-1)[corner]
     right = (corner >= 0) & (cut.vert_chart[image] == np.repeat(lead[rows], 3))
     out[vert[right]] = image[right]
-    # an edge that is cut on one side alone: one vertex has two images
+    # an edge that is cut on one side alone: one vertex has two images, or is that of two
     torn = np.zeros(cut.num_charts, bool)
     torn[cut.vert_chart[vert[right & (out[vert] != image)]]] = True
+    some = np.flatnonzero(out >= 0)
+    torn[cut.vert_chart[some[np.bincount(out[some], minlength=len(out))[out[some]] > 1]]] = True
     known = np.bincount(cut.vert_chart, out >= 0, minlength=cut.num_charts)
     size = np.bincount(cut.vert_chart, minlength=cut.num_charts)
     return out, ~torn & (known > _KNOWN * size)
