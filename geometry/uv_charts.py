@@ -166,8 +166,8 @@ class Atlas:
         bad = faces = charts[cut.chart] & ~(self.density < _CRUSHED)
         if not bad.any():
             return self
+        free = np.zeros(len(cut.origin), bool)
         for _ in range(rings + 1):
-            free = np.zeros(len(cut.origin), bool)
             free[cut.faces[faces]] = True
             faces = charts[cut.chart] & free[cut.faces].any(1)
         uv = extended(self.surface, cut, self.uv, ~free) if border else self.uv

@@ -114,6 +114,8 @@ def symmetric_start(surface: Surface, seams: Bool[np.ndarray, "E"]) -> Bool[np.n
     cut = CutMesh.of(surface.edges, seams)
     mates = chart_mates(surface, cut)
     seams = seams.copy()
+    if surface.mirror is None:
+        return seams
     for chart in np.flatnonzero((cut.euler == 2) & (mates == np.arange(len(mates)))):
         some = np.flatnonzero(cut.vert_chart == chart)
         graph = surface.graph(cut)

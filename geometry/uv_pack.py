@@ -155,7 +155,8 @@ def _searched(board: Board, sizes: np.ndarray, trials: int) -> list[tuple[int, R
 
 def _same(one: Recipe, other: Recipe) -> bool:
     """Whether two recipes put every chart to the same place."""
-    return np.array_equal(one.turns, other.turns) and np.array_equal(one.goals, other.goals)
+    pairs = ((one.turns, other.turns), (one.goals, other.goals))
+    return all(a is not None and b is not None and np.array_equal(a, b) for a, b in pairs)
 
 
 def _narrowest(board: Board, recipe: Recipe, width: int) -> tuple[int, Recipe] | None:

@@ -72,7 +72,8 @@ class Surface:
 
         mirror = np.arange(len(self.verts)) if self.mirror is None else self.mirror
         centre = self.verts[self.faces].mean(1)
-        return KDTree(centre).query(self.verts[mirror[self.faces]].mean(1))[1]
+        _, nearest = KDTree(centre).query(self.verts[mirror[self.faces]].mean(1))
+        return np.asarray(nearest, np.int64)
 
     @cached_property
     def corner_image(self) -> Int[np.ndarray, "F 3"]:
