@@ -123,6 +123,8 @@ def symmetric_start(surface: Surface, seams: Bool[np.ndarray, "E"]) -> Bool[np.n
         begin = some[[distance[some].argmax()]]
         image = some[cut.origin[some] == surface.mirror[cut.origin[begin[0]]]]
         distance, before = _shortest(graph, begin)
+        # a vertex near the plane has its image beside it: a slit has to reach farther than that
+        image = image[distance[image] > 0.2 * distance[some].max()]
         path = path_edges(surface, cut, before, image)
         seams[symmetric_edges(surface, cut, path)] = True
     return seams
