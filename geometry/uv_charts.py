@@ -8,15 +8,37 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .uv_energy import ISOMETRIC, RestShape, face_energy
-from .uv_flatten import arap_map, flipped_charts, harmonic_map, lscm_map, slim_start
+from .uv_flatten import (
+    arap_map,
+    flipped_charts,
+    harmonic_map,
+    lscm_map,
+    slim_start,
+    smoothed_inside,
+)
 from .uv_mesh import CutMesh
-from .uv_mirror import chart_mates, mirrored_edges
+from .uv_mirror import (
+    chart_mates,
+    extended,
+    image_vertices,
+    mirrored_edges,
+    symmetric_edges,
+    symmetric_start,
+)
 from .uv_newton import relaxed_charts
 from .uv_overlap import overlapping_pairs
 from .uv_seams import Surface, cut_to_discs
 from .uv_split import fiedler, split_paths
 
 _ROUNDS = 40
+_WORSE = 0.05
+"""Part by which a reflected chart may have more excess than its image before it is relaxed."""
+_FAR = 20.0
+"""How many times the excess of its image such a chart may have to be mended at all."""
+_CRUSHED, _RINGS = 100.0, 3
+"""Excess per area of a face that is laid out anew, and how many rings of others with it."""
+_MEND_STEPS = 5
+"""Newton steps after which such a chart is good enough: it starts near the lowest energy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +55,11 @@ class Atlas:
         """Energy per area of each face above that of an isometry."""
         return face_energy(self.rest.jacobians(self.corner_uv)) - ISOMETRIC
 
+    @cached_property
+    def mates(self) -> Int[np.ndarray, "C"]:
+        """The chart that is the mirror image of each one, see `chart_mates`."""
+        return chart_mates(self.surface, self.cut)
+
     @property
     def corner_uv(self) -> Float[np.ndarray, "F 3 2"]:
         """Coordinates per face corner."""
@@ -42,6 +69,16 @@ class Atlas:
     def face_excess(self) -> Float[np.ndarray, "F"]:
         """Energy of each face above that of an isometry."""
         return self.density * self.rest.area
+
+    @cached_property
+    def chart_excess(self) -> Float[np.ndarray, "C"]:
+        """The same of each chart."""
+        return np.bincount(self.cut.chart, self.face_excess, minlength=self.cut.num_charts)
+
+    @property
+    def chart_area(self) -> Float[np.ndarray, "C"]:
+        """Area of each chart on the surface."""
+        return np.bincount(self.cut.chart, self.rest.area, minlength=self.cut.num_charts)
 
     @property
     def mean_energy(self) -> float:
@@ -66,8 +103,27 @@ class Atlas:
     def relaxed(
         self, steps: int, faces: Bool[np.ndarray, "F"] | None = None, gain: float = 1e-3
     ) -> "Atlas":
-        """After some Newton steps on the charts of some faces."""
-        some = np.arange(len(self.cut.faces)) if faces is None else np.flatnonzero(faces)
+        """After some Newton steps on the charts of some faces.
+
+        Of two charts that mirror each other one is relaxed, and reflected onto the other.
+        """
+        count = self.cut.num_charts
+        active = np.ones(count, bool)
+        if faces is not None:
+            active = np.bincount(self.cut.chart[faces], minlength=count) > 0
+        follows = self._image[1] & active & active[self.mates]
+        out = self._solved(steps, active & ~follows, gain)
+        if not follows.any():
+            return out
+        out, near, alone = out._reflected(follows)
+        return out._solved(min(steps, _MEND_STEPS), near, gain)._solved(steps, alone, gain)
+
+    @cached_property
+    def _image(self) -> "tuple[np.ndarray, np.ndarray]":
+        return image_vertices(self.surface, self.cut, self.mates)
+
+    def _solved(self, steps: int, charts: Bool[np.ndarray, "C"], gain: float) -> "Atlas":
+        some = np.flatnonzero(charts[self.cut.chart])
         if len(some) == 0:
             return self
         uv = relaxed_charts(
@@ -78,7 +134,48 @@ class Atlas:
             steps,
             gain,
         )
-        return Atlas(self.surface, self.rest, self.cut, uv)
+        return self.moved(uv)
+
+    def moved(self, uv: Float[np.ndarray, "W 2"]) -> "Atlas":
+        """Other coordinates on the same cut."""
+        out = Atlas(self.surface, self.rest, self.cut, uv)
+        for name in ("mates", "_image"):  # they depend on the cut alone
+            if name in self.__dict__:
+                out.__dict__[name] = self.__dict__[name]
+        return out
+
+    def _reflected(
+        self, follows: Bool[np.ndarray, "C"]
+    ) -> "tuple[Atlas, Bool[np.ndarray, 'C'], Bool[np.ndarray, 'C']]":
+        """Some charts as the mirror images of theirs; those that are worse, and those that stay."""
+        image = np.where(follows[self.cut.vert_chart], self._image[0], -2)
+        uv = np.where(image[:, None] >= 0, self.uv[image] * [-1.0, 1.0], self.uv)
+        trial = self.moved(extended(self.surface, self.cut, uv, image != -1))
+        for rings in range(_RINGS):
+            trial = trial._mended(follows, rings, False)._mended(follows, rings, True)
+        excess = trial.chart_excess
+        lead = excess[self.mates]
+        worse = follows & ~(excess <= (1 + _WORSE) * lead + _WORSE * 1e-2 * trial.chart_area)
+        stays = worse & ~(excess <= np.maximum(self.chart_excess, _FAR * lead))
+        back = stays[self.cut.vert_chart][:, None]
+        return self.moved(np.where(back, self.uv, trial.uv)), worse & ~stays, stays
+
+    def _mended(self, charts: Bool[np.ndarray, "C"], rings: int, border: bool) -> "Atlas":
+        """Flipped faces of some charts, and some rings around them, laid out anew if that helps."""
+        cut = self.cut
+        bad = faces = charts[cut.chart] & ~(self.density < _CRUSHED)
+        if not bad.any():
+            return self
+        free = np.zeros(len(cut.origin), bool)
+        for _ in range(rings + 1):
+            free[cut.faces[faces]] = True
+            faces = charts[cut.chart] & free[cut.faces].any(1)
+        uv = extended(self.surface, cut, self.uv, ~free) if border else self.uv
+        trial = self.moved(smoothed_inside(cut, self.surface.flat, uv, free))
+        before = np.bincount(cut.chart, bad, minlength=cut.num_charts)
+        after = np.bincount(cut.chart, ~(trial.density < _CRUSHED), minlength=cut.num_charts)
+        helps = (after < before)[cut.vert_chart][:, None]
+        return self.moved(np.where(helps, trial.uv, self.uv))
 
     def overlaps(self, faces: Bool[np.ndarray, "F"] | None = None) -> Int[np.ndarray, "n 2"]:
         """Pairs of faces (of some) of one chart that lie on each other."""
@@ -121,14 +218,20 @@ def first_atlas(surface: Surface, seams: Bool[np.ndarray, "E"]) -> Atlas:
         endless = ~np.isfinite(face_energy(rest.jacobians(uv[cut.faces])))
         bad = np.union1d(flipped_charts(cut, uv), np.unique(cut.chart[endless]))
         if len(bad) == 0:
-            uv = slim_start(cut, surface.verts, uv, np.arange(cut.num_charts))
-            return Atlas(surface, rest, cut, uv)
+            return _started(Atlas(surface, rest, cut, uv))
         seams = seams.copy()
         seams[halves(surface, cut, bad, rest.area)] = True
     cut = CutMesh.of(surface.edges, np.ones(len(seams), bool))
     uv = np.zeros((len(cut.origin), 2))
     uv[cut.faces[:, 1:]] = np.linalg.inv(rest.inverse).transpose(0, 2, 1)
     return Atlas(surface, rest, cut, uv)
+
+
+def _started(atlas: Atlas) -> Atlas:
+    """The first iterations; one of two charts that mirror each other is spared them."""
+    follows = atlas._image[1]
+    uv = slim_start(atlas.cut, atlas.surface.verts, atlas.uv, np.flatnonzero(~follows))
+    return atlas.moved(uv)._reflected(follows)[0]
 
 
 def shared_out(
@@ -145,6 +248,7 @@ def shared_out(
         Edges to cut.
     """
     area = surface.rest.area
+    seams = symmetric_start(surface, seams)
     for _ in range(_ROUNDS):
         seams = cut_to_discs(surface, seams)
         cut = CutMesh.of(surface.edges, seams)
@@ -154,7 +258,12 @@ def shared_out(
         leads = large[~((mates[large] >= 0) & (mates[large] < large))]
         extra = halves(surface, cut, leads, area)
         owner = cut.chart[np.maximum(cut.edges.face_pairs[extra, 0], 0)]
-        extra = np.concatenate([extra, mirrored_edges(surface, extra[mates[owner] > owner])])
+        own = [
+            symmetric_edges(surface, cut, extra[owner == c]) for c in leads[mates[leads] == leads]
+        ]
+        others = extra[mates[owner] != owner]
+        image = mirrored_edges(surface, extra[mates[owner] > owner])
+        extra = np.concatenate([*own, others, image])
         extra = extra[~seams[extra]]
         if len(extra) == 0:
             break

@@ -118,6 +118,36 @@ def harmonic_map(
     return uv
 
 
+def smoothed_inside(
+    cut: CutMesh, flat: Float[np.ndarray, "F 2 2"], uv: Float[np.ndarray, "W 2"], free: np.ndarray
+) -> Float[np.ndarray, "W 2"]:
+    """Some vertices inside discs brought into equilibrium, the others held.
+
+    Args:
+        cut: the cut mesh.
+        flat: its triangles laid into the plane.
+        uv: coordinates of its vertices.
+        free: mask of the vertices; those on the border are held too.
+
+    Returns:
+        Coordinates.
+
+    Reference:
+        Floater 2003 (mean value).
+    """
+    free = free & (cut.loop < 0)
+    rows = np.flatnonzero(free[cut.faces].any(1))
+    if len(rows) == 0:
+        return uv
+    used, local = np.unique(cut.faces[rows], return_inverse=True)
+    matrix = laplacian(local.reshape(-1, 3), len(used), flat[rows], "mean_value").tocsr()
+    inside = free[used]
+    matrix = matrix[inside]
+    out = uv.copy()
+    out[used[inside]] = _solve(matrix[:, inside].tocsc(), -(matrix[:, ~inside] @ uv[used[~inside]]))
+    return out
+
+
 def _solve(matrix: Any, right: np.ndarray) -> np.ndarray:
     factors = factorised(matrix)
     out = factors.solve(right)

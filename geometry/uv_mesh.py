@@ -177,7 +177,8 @@ def components(
         return np.zeros(0, np.int64)
     graph = coo_matrix((np.ones(len(a), bool), (a, b)), (count, count))
     _, label = connected_components(graph, directed=False)
-    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
+    first = np.zeros(int(label.max()) + 1, np.int64)
+    first[label[::-1]] = np.arange(count)[::-1]
     rank = np.zeros(len(first), np.int64)
-    rank[np.argsort(first, kind="stable")] = np.arange(len(first))
-    return rank[inverse]
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[label]

@@ -1,10 +1,17 @@
 """Seams of a symmetric mesh brought to its other side."""
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from .uv_mesh import CutMesh
-from .uv_seams import Surface, edge_index
+from .uv_seams import Surface, _shortest, edge_index, path_edges
+from .uv_split import charts_after
+
+_SLIVER = 0.03
+"""Share of a chart below which what mirrored seams leave between them is no chart of its own."""
+_KNOWN = 0.9
+"""Share of the vertices of a chart that must have an image for the chart to be one."""
+_LAYERS = 10
 
 
 def mirrored_edges(surface: Surface, some: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:
@@ -43,35 +50,84 @@ def _way_around(surface: Surface, a: int, b: int) -> np.ndarray:
     return np.sort(np.array([[a, middle], [middle, b]]), 1)
 
 
-def symmetric_edges(surface: Surface, some: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:
-    """The half of some edges that is longer, and its mirror image; a path that is its own stays.
+def symmetric_edges(
+    surface: Surface, cut: CutMesh, some: Int[np.ndarray, "n"]
+) -> Int[np.ndarray, "m"]:
+    """The half of some edges that is longer, and its mirror image, without slivers between them.
 
     Args:
         surface: a mesh; without a mirror plane the edges stay as they are.
+        cut: its cut; the edges are not cut yet.
         some: edge indices.
 
     Returns:
         Edge indices, each once.
     """
-    if surface.side is None or len(some) == 0 or _own_image(surface, some):
+    if surface.side is None or len(some) == 0:
         return some
     place = surface.side[surface.edges.verts[some]].mean(1)
     near = 1e-3 * float(surface.length.mean())
     left, right = some[place > near], some[place < -near]
     longer = left if surface.length[left].sum() >= surface.length[right].sum() else right
     middle = some[np.abs(place) <= near]
-    return np.unique(np.concatenate([longer, middle, mirrored_edges(surface, longer)]))
+    both = np.unique(np.concatenate([longer, middle, mirrored_edges(surface, longer)]))
+    return _without_slivers(surface, cut, both[~cut.seams[both]])
 
 
-def _own_image(surface: Surface, some: np.ndarray) -> bool:
-    """Whether the image of most vertices of some edges lies within an edge or two of them."""
-    from scipy.spatial import KDTree
+def _without_slivers(surface: Surface, cut: CutMesh, some: np.ndarray) -> np.ndarray:
+    """Edges between small pieces and their longest neighbours left out, the plane put in."""
+    area, pairs = surface.rest.area, surface.edges.face_pairs
+    piece = charts_after(cut, some)
+    whole = np.bincount(cut.chart, area, minlength=cut.num_charts)
+    tiny = np.bincount(piece, area)[piece] < _SLIVER * whole[cut.chart]
+    if surface.side is None or not tiny.any():
+        return some
+    right = surface.side[surface.faces].mean(1) > 0
+    inner = np.flatnonzero(~cut.seams)
+    a, b = pairs[inner].T
+    middle = inner[tiny[a] & tiny[b] & (right[a] != right[b])]
+    some = np.union1d(some, middle)
+    piece = charts_after(cut, some)
+    gone = np.zeros(len(cut.seams), bool)
+    small = np.zeros(int(piece.max()) + 1, bool)
+    small[piece[tiny]] = True
+    for number in np.flatnonzero(small):
+        own = piece[pairs[some]] == number
+        rows = np.flatnonzero(own.sum(1) == 1)
+        other = piece[pairs[some[rows]]][~own[rows]]
+        shared = np.bincount(other, surface.length[some[rows]] * ~small[other])
+        if shared.any():
+            gone[some[rows[other == shared.argmax()]]] = True
+    return some[~gone[some]]
 
-    used = np.unique(surface.edges.verts[some])
-    places = surface.verts[used]
-    image = surface.verts[np.zeros(0, np.int64) if surface.mirror is None else surface.mirror[used]]
-    distance = KDTree(places).query(image)[0]
-    return bool((distance <= 1.5 * surface.length[some].mean()).mean() > 0.8)
+
+def symmetric_start(surface: Surface, seams: Bool[np.ndarray, "E"]) -> Bool[np.ndarray, "E"]:
+    """Closed spheres that are their own mirror image slit along a path that is its own too.
+
+    Args:
+        surface: the mesh.
+        seams: edges that are cut already.
+
+    Returns:
+        Edges to cut.
+    """
+    cut = CutMesh.of(surface.edges, seams)
+    mates = chart_mates(surface, cut)
+    seams = seams.copy()
+    if surface.mirror is None:
+        return seams
+    for chart in np.flatnonzero((cut.euler == 2) & (mates == np.arange(len(mates)))):
+        some = np.flatnonzero(cut.vert_chart == chart)
+        graph = surface.graph(cut)
+        distance, _ = _shortest(graph, some[:1])
+        begin = some[[distance[some].argmax()]]
+        image = some[cut.origin[some] == surface.mirror[cut.origin[begin[0]]]]
+        distance, before = _shortest(graph, begin)
+        # a vertex near the plane has its image beside it: a slit has to reach farther than that
+        image = image[distance[image] > 0.2 * distance[some].max()]
+        path = path_edges(surface, cut, before, image)
+        seams[symmetric_edges(surface, cut, path)] = True
+    return seams
 
 
 def chart_mates(surface: Surface, cut: CutMesh) -> Int[np.ndarray, "C"]:
@@ -84,15 +140,11 @@ def chart_mates(surface: Surface, cut: CutMesh) -> Int[np.ndarray, "C"]:
     Returns:
         Chart numbers.
     """
-    from scipy.spatial import KDTree
-
     count = cut.num_charts
     mates = np.full(count, -1, np.int64)
     if surface.mirror is None:
         return mates
-    centre = surface.verts[surface.faces].mean(1)
-    image = KDTree(centre).query(surface.verts[surface.mirror[surface.faces]].mean(1))[1]
-    key, votes = np.unique(cut.chart * count + cut.chart[image], return_counts=True)
+    key, votes = np.unique(cut.chart * count + cut.chart[surface.face_image], return_counts=True)
     order = np.lexsort((-votes, key // count))
     _, first = np.unique(key[order] // count, return_index=True)
     best, most = key[order][first] % count, votes[order][first]
@@ -100,6 +152,72 @@ def chart_mates(surface: Surface, cut: CutMesh) -> Int[np.ndarray, "C"]:
     good = (most > 0.7 * size) & (best[best] == np.arange(count))
     mates[good] = best[good]
     return mates
+
+
+def image_vertices(
+    surface: Surface, cut: CutMesh, mates: Int[np.ndarray, "C"]
+) -> tuple[Int[np.ndarray, "W"], Bool[np.ndarray, "C"]]:
+    """Where a chart can take the coordinates of its vertices from: its image of a lower number.
+
+    Args:
+        surface: the mesh.
+        cut: its cut.
+        mates: of `chart_mates`.
+
+    Returns:
+        The vertex of the cut mesh at the mirror image of each, −1 for none; and the charts that
+        have such an image, but for a few vertices at faces that have none.
+    """
+    out = np.full(len(cut.origin), -1, np.int64)
+    lead = mates[cut.chart]
+    rows = np.flatnonzero((lead >= 0) & (lead < cut.chart))
+    vert = cut.faces[rows].reshape(-1)
+    corner = surface.corner_image[rows].reshape(-1)
+    image = cut.faces.reshape(-1)[corner]
+    right = (corner >= 0) & (cut.vert_chart[image] == np.repeat(lead[rows], 3))
+    out[vert[right]] = image[right]
+    # an edge that is cut on one side alone: one vertex has two images, or is that of two
+    torn = np.zeros(cut.num_charts, bool)
+    torn[cut.vert_chart[vert[right & (out[vert] != image)]]] = True
+    some = np.flatnonzero(out >= 0)
+    torn[cut.vert_chart[some[np.bincount(out[some], minlength=len(out))[out[some]] > 1]]] = True
+    known = np.bincount(cut.vert_chart, out >= 0, minlength=cut.num_charts)
+    size = np.bincount(cut.vert_chart, minlength=cut.num_charts)
+    return out, ~torn & (known > _KNOWN * size)
+
+
+def extended(
+    surface: Surface, cut: CutMesh, uv: Float[np.ndarray, "W 2"], known: Bool[np.ndarray, "W"]
+) -> Float[np.ndarray, "W 2"]:
+    """Coordinates of some vertices by those beside them and the shapes of the faces between.
+
+    Args:
+        surface: the mesh.
+        cut: its cut.
+        uv: coordinates of its vertices.
+        known: which of them are right.
+
+    Returns:
+        Coordinates; a vertex far from those that are known stays.
+    """
+    z = uv[:, 0] + 1j * uv[:, 1]
+    rows = np.flatnonzero(~known[cut.faces].all(1))
+    flat = surface.flat[rows]
+    rest = np.pad(flat[:, 0] + 1j * flat[:, 1], ((0, 0), (1, 0)))
+    for _ in range(_LAYERS):
+        total, number = np.zeros(len(z), complex), np.zeros(len(z))
+        for k in range(3):
+            ends = cut.faces[rows][:, [k, k - 2, k - 1]].T
+            some = ~known[ends[0]] & known[ends[1]] & known[ends[2]]
+            (p, q, r), (a, b, c) = rest[some][:, [k, k - 2, k - 1]].T, ends[:, some]
+            np.add.at(total, a, z[b] + (p - q) / (r - q) * (z[c] - z[b]))
+            np.add.at(number, a, 1)
+        fresh = number > 0
+        if not fresh.any():
+            break
+        z[fresh] = total[fresh] / number[fresh]
+        known = known | fresh
+    return np.stack([z.real, z.imag], 1)
 
 
 def seam_symmetry(surface: Surface, seams: Bool[np.ndarray, "E"]) -> float:

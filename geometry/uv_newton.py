@@ -49,18 +49,30 @@ class NewtonSolver:
         self.vert_chart = np.zeros(self.num_verts, np.int64)
         self.vert_chart[self.faces.reshape(-1)] = np.repeat(self.chart, 3)
         self._place = _sparse_order(self.faces, self.num_verts)
-        place = 2 * self._place[self.faces]
-        slots = np.stack([place, place + 1], -1).reshape(len(self.faces), 6)
-        rows = np.repeat(slots, 6, axis=1).reshape(-1)
-        cols = np.tile(slots, (1, 6)).reshape(-1)
-        size = 2 * self.num_verts
-        key, self._slot = np.unique(cols * size + rows, return_inverse=True)
-        self._indices = (key % size).astype(np.int32)
-        self._indptr = np.searchsorted(key // size, np.arange(size + 1)).astype(np.int32)
-        self._diagonal = np.flatnonzero(key % size == key // size)
-        self._unknown = slots.reshape(-1)
+        place = self._place[self.faces]
+        self._lay_out(place)
+        self._unknown = np.stack([2 * place, 2 * place + 1], -1).reshape(-1)
         self._corners = corner_columns(self.rest.inverse)
         self._area = np.bincount(self.chart, self.rest.area, minlength=self.num_charts)
+
+    def _lay_out(self, place: Int[np.ndarray, "F 3"]) -> None:
+        """Where the entries of each face come in the matrix, found by blocks of two by two."""
+        count = self.num_verts
+        rows, cols = np.repeat(place, 3, axis=1), np.tile(place, (1, 3))
+        block, of_face = np.unique((cols * count + rows).reshape(-1), return_inverse=True)
+        col, row = np.divmod(block, count)
+        first = np.searchsorted(col, np.arange(count + 1))
+        size = np.diff(first)
+        start = 4 * first[col] + 2 * (np.arange(len(block)) - first[col])
+        two = np.arange(2)
+        # the entries of the first column of all blocks of a column come before those of the second
+        at = start[:, None, None] + two[:, None] + (2 * size[col])[:, None, None] * two
+        self._slot = at[of_face.reshape(-1, 3, 3)].transpose(0, 1, 3, 2, 4).reshape(-1)
+        self._indices = np.zeros(4 * len(block), np.int32)
+        self._indices[at] = (2 * row[:, None] + two)[:, :, None]
+        ends = np.stack([4 * first[:-1], 4 * first[:-1] + 2 * size], 1).reshape(-1)
+        self._indptr = np.append(ends, 4 * len(block)).astype(np.int32)
+        self._diagonal = np.sort(at[row == col][:, two, two].reshape(-1))
 
     def energies(self, uv: Float[np.ndarray, "W 2"]) -> Float[np.ndarray, "C"]:
         """Mean energy per area of each chart; infinite where a face is flipped."""

@@ -8,7 +8,7 @@ from jaxtyping import Int
 
 from .uv_charts import Atlas, first_guess, halves
 from .uv_energy import ISOMETRIC
-from .uv_mirror import chart_mates, mirrored_edges, symmetric_edges
+from .uv_mirror import mirrored_edges, symmetric_edges
 from .uv_split import charts_after, fiedler, separators, sign_changes, split_paths, tip_slits
 
 _ROUNDS = 80
@@ -20,8 +20,6 @@ _NEAR = 1.5
 """Excess, in that of the target, below which the charts are relaxed before more are cut."""
 _CHART_PRICE = 0.15
 """What a chart costs, as a length of seam, in units of the square root of the area."""
-_FOLD_PRICE = 0.0
-"""What a chart that lies on itself costs, in charts."""
 _SEAM_PRICE = 0.1
 """What any seam costs, however short."""
 
@@ -122,10 +120,9 @@ def _best(moves: list[Move], atlas: Atlas, target: float) -> list[Move]:
 
 def _units(atlas: Atlas) -> list[tuple[int, ...]]:
     """Charts that are changed together: a chart and its mirror image, or one alone."""
-    mates = chart_mates(atlas.surface, atlas.cut)
     return [
         (chart, int(mate)) if mate > chart else (chart,)
-        for chart, mate in enumerate(mates)
+        for chart, mate in enumerate(atlas.mates)
         if mate < 0 or mate >= chart
     ]
 
@@ -174,15 +171,14 @@ def _moves_of(atlas: Atlas, units: list[tuple[int, ...]], edges: np.ndarray) -> 
         own = edges[chart == lead]
         if len(unit) > 1:
             own = np.union1d(own, mirrored_edges(surface, own))
-        elif surface.mirror is not None and _is_own_mate(atlas, lead):
-            own = symmetric_edges(surface, own)
+        elif atlas.mates[lead] == lead:
+            own = symmetric_edges(surface, cut, own[~cut.seams[own]])
         groups.append(own[~cut.seams[own]])
     trial = atlas.opened(np.concatenate(groups))
     active = np.isin(cut.chart, np.concatenate(units))
     trial = trial.relaxed(_steps(_TRIAL_STEPS, atlas), active)
     corner, before, after = trial.corner_uv, atlas.face_excess, trial.face_excess
     scale = float(np.sqrt(atlas.rest.area.sum()))
-    folded = np.unique(trial.cut.chart[trial.overlaps(active)[:, 0]])
     # what was cut besides, to come to discs, belongs to the move: its coordinates need it
     fresh = np.flatnonzero(trial.cut.seams & ~cut.seams)
     owner = cut.chart[cut.edges.face_pairs[fresh, 0]]
@@ -190,35 +186,40 @@ def _moves_of(atlas: Atlas, units: list[tuple[int, ...]], edges: np.ndarray) -> 
     for unit in units:
         own = fresh[np.isin(owner, unit)]
         faces = np.flatnonzero(np.isin(cut.chart, unit))
-        pieces = np.unique(trial.cut.chart[faces])
-        # a piece that lies on itself has to be cut later
-        new = len(pieces) - len(unit) + _FOLD_PRICE * np.isin(pieces, folded).sum()
+        new = len(np.unique(trial.cut.chart[faces])) - len(unit)
         price = _SEAM_PRICE + float(surface.length[own].sum()) / scale + _CHART_PRICE * new
         gain = float(before[faces].sum() - after[faces].sum())
         moves.append(Move(own, faces, corner[faces], gain, price))
     return moves
 
 
-def _is_own_mate(atlas: Atlas, chart: int) -> bool:
-    return int(chart_mates(atlas.surface, atlas.cut)[chart]) == chart
-
-
 def _separated(atlas: Atlas, pairs: Int[np.ndarray, "n 2"]) -> Atlas:
-    """Every chart that lies on itself cut in two, so that most of the faces that meet part."""
+    """Every chart that lies on itself cut in two, so that most of the faces that meet part.
+
+    Of two such charts that mirror each other one is told where, the other is cut there too.
+    """
     cut, surface, area = atlas.cut, atlas.surface, atlas.rest.area
-    charts = np.unique(cut.chart[pairs[:, 0]])
+    folded = np.bincount(cut.chart[pairs[:, 0]], minlength=cut.num_charts) > 0
+    follows = folded & (atlas.mates >= 0) & (atlas.mates < np.arange(len(folded)))
+    follows &= folded[atlas.mates]
+    pairs = pairs[~follows[cut.chart[pairs[:, 0]]]]
+    charts = np.flatnonzero(folded & ~follows)
     meets = np.bincount(pairs.reshape(-1), minlength=len(cut.chart)) > 0
     start = first_guess(surface)[cut.origin]
     slow = fiedler(surface, cut, start, area, charts)
-    folded = fiedler(surface, cut, start, area * (meets + 0.01), charts)
-    fields = [(separators(surface, cut, pairs, f), area * (meets + 0.01)) for f in (slow, folded)]
-    fields += [(slow, area), (folded, area * (meets + 0.01))]
+    heavy = area * (meets + 0.01)
+    around = fiedler(surface, cut, start, heavy, charts)
+    fields = [(separators(surface, cut, pairs, f), heavy) for f in (slow, around)]
+    fields += [(slow, area), (around, heavy)]
     options = [split_paths(surface, cut, field, weight, charts) for field, weight in fields]
     options.append(sign_changes(cut, fields[0][0]))
     edges = _parting(atlas, pairs, options)
     if len(edges) == 0:
         return atlas.opened(cut.edges.of_face[pairs[:, 0]].reshape(-1))
-    active = np.isin(cut.chart, charts)
+    lead = cut.chart[np.maximum(cut.edges.face_pairs[edges, 0], 0)]
+    image = mirrored_edges(surface, edges[np.isin(atlas.mates[lead], np.flatnonzero(follows))])
+    edges = np.union1d(edges, image[~cut.seams[image]])
+    active = folded[cut.chart]
     return atlas.opened(edges).relaxed(_steps(_TRIAL_STEPS, atlas), active)
 
 

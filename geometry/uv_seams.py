@@ -15,6 +15,9 @@ _SHOWN = 3.0
 _CELLS = 4096  # of a depth map along the longest side, at most
 """How much dearer a seam is where the surface is seen from everywhere than where from nowhere."""
 
+_LONE = 4.0
+"""How much dearer a seam of a symmetric mesh is where its triangles have no mirror image."""
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -55,7 +58,34 @@ class Surface:
         if self.mirror is not None:
             seen = (seen + seen[self.mirror]) / 2
         floor = 1e-6 * max(float(self.length.max(initial=0.0)), 1e-30)
-        return np.maximum(self.length, floor) * (1 + _SHOWN * seen[self.edges.verts].mean(1))
+        cost = np.maximum(self.length, floor) * (1 + _SHOWN * seen[self.edges.verts].mean(1))
+        if self.mirror is not None:
+            # a seam that has a mirror image leaves two charts of which one tells the other
+            lone = np.zeros(len(self.verts), bool)
+            lone[self.faces[self.corner_image[:, 0] < 0]] = True
+            cost = cost * np.where(lone[self.edges.verts].any(1), _LONE, 1.0)
+        return cost
+
+    @cached_property
+    def face_image(self) -> Int[np.ndarray, "F"]:
+        """The face nearest to the mirror image of each face, for a symmetric surface."""
+        from scipy.spatial import KDTree
+
+        mirror = np.arange(len(self.verts)) if self.mirror is None else self.mirror
+        centre = self.verts[self.faces].mean(1)
+        _, nearest = KDTree(centre).query(self.verts[mirror[self.faces]].mean(1))
+        return np.asarray(nearest, np.int64)
+
+    @cached_property
+    def corner_image(self) -> Int[np.ndarray, "F 3"]:
+        """The corner (3 · face + corner) at the mirror image of each, −1 where no face is it."""
+        if self.mirror is None:
+            return np.full(self.faces.shape, -1, np.int64)
+        there = self.faces[self.face_image]
+        match = self.mirror[self.faces][:, :, None] == there[:, None]
+        found = 3 * self.face_image[:, None] + match.argmax(2)
+        whole = match.any(1).all(1) & match.any(2).all(1)
+        return np.where(whole[:, None], found, -1)
 
     @classmethod
     def of(

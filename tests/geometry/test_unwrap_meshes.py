@@ -42,25 +42,42 @@ def test_the_body_ships_with_a_sound_layout() -> None:
     assert _symmetry(BODY.v_template, BODY.faces, BODY.uv.corner_uv) >= 0.5
 
 
+@pytest.fixture(scope="module")
+def usual() -> UVLayout:
+    return unwrap(BODY.v_template, BODY.faces)
+
+
+@pytest.fixture(scope="module")
+def few() -> UVLayout:
+    return unwrap(BODY.v_template, BODY.faces, target=4.15)
+
+
 @pytest.mark.slow
-def test_the_layout_of_the_body_is_what_unwrap_gives() -> None:
+def test_the_body_unwraps_as_well_as_its_shipped_layout(usual: UVLayout) -> None:
+    # the shipped coordinates were made by an earlier engine: their figures are reached, not they
     assert BODY.uv is not None
-    again = unwrap(BODY.v_template, BODY.faces)
-    _sound(again)
+    _sound(usual)
+    report = usual.report
+    assert report.charts <= 55 and report.symmetric_dirichlet <= 4.03
+    assert report.packing >= 0.7 and report.seam_length <= 20
     shipped = uv_report(BODY.v_template, BODY.faces, BODY.uv.corner_uv)
-    # another processor may round otherwise: the figures agree, here the coordinates too
-    assert abs(again.report.charts - shipped.charts) <= 3
-    assert abs(again.report.symmetric_dirichlet - shipped.symmetric_dirichlet) < 5e-3
-    assert abs(again.report.seam_length - shipped.seam_length) < 2
+    assert report.charts <= shipped.charts + 3
+    assert report.seam_length < shipped.seam_length + 2
+    assert report.packing > shipped.packing - 0.02
 
 
 @pytest.mark.slow
-def test_few_charts_without_parts() -> None:
-    layout = unwrap(BODY.v_template, BODY.faces, target=4.15)
-    _sound(layout)
-    report = layout.report
+def test_few_charts_without_parts(few: UVLayout) -> None:
+    _sound(few)
+    report = few.report
     assert report.charts <= 25 and report.symmetric_dirichlet <= 4.15
     assert report.packing >= 0.6 and report.seam_length <= 20
+
+
+@pytest.mark.slow
+def test_seams_of_the_body_mirror_each_other(usual: UVLayout, few: UVLayout) -> None:
+    for layout in (usual, few):
+        assert _symmetry(BODY.v_template, BODY.faces, layout.corner_uv) >= 0.85
 
 
 @pytest.mark.slow
