@@ -108,7 +108,7 @@ class AppearanceConfig:
     light: bool = True
     """The colour sees which way the surface below looks in the world: light stands still while the
     person turns."""
-    light_out: float = 0.25
+    light_out: float = 0.1
     """Share of training frames whose light a step leaves out: what surfaces look like, in the mean,
     that look away from all training cameras."""
     leave_out: float = 0.5
@@ -133,7 +133,7 @@ class LossConfig:
     consistency_threshold: float = 0.002
     """Round-trip distances below this cost nothing, metres; at larger ones frames are learned
     by heart."""
-    consistency_samples: int = 2048
+    consistency_samples: int = 1024
     """Pairs of a step whose round trip is computed."""
     offset: float = 0.0
     """Weight of the mean residual length, 1/m."""

@@ -82,12 +82,7 @@ def _baselines() -> dict[str, Config]:
 
 def _presets() -> dict[str, Config]:
     fast = Config(preset="fast")
-    best = Config(
-        preset="best",
-        appearance=AppearanceConfig(light_out=0.1),
-        loss=LossConfig(consistency_samples=1024),
-        train=TrainConfig(seconds=1680.0),
-    )
+    best = Config(preset="best", train=TrainConfig(seconds=1680.0))
     tiny = Config(preset="tiny", train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0))
     rigid = Config(preset="rigid", appearance=UNLIT, deform=DeformConfig(residual=False))
     full = Config(preset="full", appearance=dataclasses.replace(UNLIT, pose_feature=True))
