@@ -232,13 +232,27 @@ class Board:
 
 
 def rotation(angle: float) -> Float[np.ndarray, "2 2"]:
-    """Matrix of a turn by an angle in radians."""
+    """Matrix of a turn.
+
+    Args:
+        angle: radians, counter-clockwise.
+
+    Returns:
+        The matrix, for columns.
+    """
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, -sin], [sin, cos]])
 
 
 def level_angle(points: Float[np.ndarray, "n 2"]) -> float:
-    """Turn that gives points the smallest upright box, of 64 turns; radians."""
+    """Turn that gives points the smallest upright box, of 64 turns.
+
+    Args:
+        points: the points.
+
+    Returns:
+        The angle, radians.
+    """
     angles = np.linspace(0, np.pi / 2, 64, endpoint=False)
     axes = np.stack([np.cos(angles), np.sin(angles)])
     along, across = points @ axes, points @ np.stack([-axes[1], axes[0]])

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from monopart.geometry import uv_pack
+from monopart.geometry import uv_board
 from monopart.geometry.body import BodyModel
 from monopart.geometry.parts import PartMap
 from monopart.geometry.unwrap import UVLayout, unwrap
@@ -178,7 +178,7 @@ def test_needles_cost_no_more_than_other_meshes(thin: float) -> None:
     assert layout.report.symmetric_dirichlet <= 4.03
     strip = np.array([[[0, 0], [1, 0], [1, thin]], [[0, 0], [1, thin], [0, thin]]])
     for grid in (96, 384):
-        board = uv_pack._Board.of([strip], np.array([thin]), grid, 1.0, 12)
+        board = uv_board.Board.of([strip], np.array([thin]), grid, 1.0, 12)
         assert board.canvas <= 2 * grid
 
 
