@@ -335,11 +335,15 @@ def summarise(cell: Cell, plan: Plan) -> dict[str, Any]:
     if (folder / "refit.json").is_file():  # scores at refit poses stand beside the others
         for row in read_facts(folder / "refit.json")["rows"]:
             metrics[f"{row['split']}@{row['column']}"] = {"strict": row["refit"]}
+    name = cell.capture.resolve().name
+    # folders by their names alone: the summary is published
+    run = f"runs/{plan.out.name}/{name}/{cell.name}/seed-{cell.seed}"
+    places = f"CAPTURES/{name}", "--out", run
     summary = {
-        "capture": cell.capture.resolve().name,
+        "capture": name,
         "cell": cell.name,
         "seed": cell.seed,
-        "command": shlex.join(("monopart", *cell.command)),
+        "command": shlex.join(("monopart", "train", *places, *cell.command[4:])),
         "images_asked": plan.images,
         "protocols_asked": plan.protocols,
         "images": counts,
