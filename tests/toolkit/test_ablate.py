@@ -111,6 +111,8 @@ def test_the_tables_are_of_the_runs(finished):
     rows = list(csv.DictReader((out / "table.csv").read_text(encoding="utf-8").splitlines()))
     stored = json.loads((out / "table.json").read_text(encoding="utf-8"))
     assert len(stored["rows"]) == len(rows) and len(stored["trainings"]) == 4
+    start = f"monopart train CAPTURES/small --out runs/{out.name}/small/"
+    assert all(t["command"].startswith(start) for t in stored["trainings"]), "no absolute paths"
     metrics = {
         (name, seed): json.loads(
             (out / "small" / name / f"seed-{seed}" / "metrics.json").read_text(encoding="utf-8")
