@@ -137,6 +137,11 @@ class LossConfig:
     """Pairs of a step whose round trip is computed."""
     offset: float = 0.0
     """Weight of the mean residual length, 1/m."""
+    unseen: float = 0.0
+    """Weight of the mean residual length at random places and times, which most pictures do not
+    show, 1/m."""
+    unseen_samples: int = 1024
+    """Places of a step."""
     l1: float = 0.0
     """Weight of the absolute colour error."""
     distortion: float = 0.0

@@ -25,6 +25,7 @@ from .losses import (
 )
 from .lpips import LPIPS
 from .model import AvatarModel, FrameInput, Rendered, Shaded
+from .unseen import UnseenResiduals
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,8 @@ class Objective:
 
         Args:
             config: weights and thresholds.
-            canonical: the canonical body, for the round trip; None leaves consistency out.
+            canonical: the canonical body, for the round trip and for places that no picture shows;
+                None leaves both terms out.
 
         Raises:
             InputError: no term compares colours in every step.
@@ -103,6 +105,9 @@ class Objective:
                 "loss.mse, loss.l1: expected a weight above 0 in one of them, found 0 in both"
             )
         self.config, self.canonical = config, canonical
+        self.unseen = None
+        if config.loss.unseen and canonical is not None:
+            self.unseen = UnseenResiduals(canonical, config.loss.unseen_samples)
         self.round_trips: Tensor | None = None  # distances of the last step, metres
 
     def color(self, seen: Seen, lpips: LPIPS | None) -> dict[str, Tensor]:
@@ -164,6 +169,9 @@ class Objective:
         if spec.offset:
             with stage("loss: offset"):
                 terms["offset"] = spec.offset * offset_loss(out.shaded.residual)
+        if self.unseen is not None:
+            with stage("loss: unseen"):
+                terms["unseen"] = spec.unseen * self.unseen.loss(model, generator)
         if spec.elastic:
             with stage("loss: elastic"):
                 terms["elastic"] = spec.elastic * self._elastic(model, out.shaded, generator)

@@ -76,8 +76,8 @@ class Trainer:
         heads = self._heads() if self.config.train.head_focus else None
         self.looks = Looks(seen, cameras, heads, self.config.train)
         self.look = self.looks.at(0.0)
-        canonical = avatar.canonical_parts() if self.config.loss.consistency else None
-        self.objective = Objective(self.config, canonical)
+        asked = self.config.loss.consistency or self.config.loss.unseen
+        self.objective = Objective(self.config, avatar.canonical_parts() if asked else None)
         self.generator = torch.Generator().manual_seed(self.config.seed)
         doubts = picture_doubts(avatar.record, seen, self.config.train.patch)
         if self.config.appearance.light:
