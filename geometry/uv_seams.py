@@ -11,10 +11,10 @@ from .uv_energy import RestShape, flat_triangles
 from .uv_mesh import CutMesh, MeshEdges
 
 _VIEWS = 48
+_CELLS = 4096
+"""Of a depth map along the longest side, at most."""
 _SHOWN = 3.0
-_CELLS = 4096  # of a depth map along the longest side, at most
 """How much dearer a seam is where the surface is seen from everywhere than where from nowhere."""
-
 _LONE = 4.0
 """How much dearer a seam of a symmetric mesh is where its triangles have no mirror image."""
 

@@ -66,16 +66,16 @@ def _published() -> dict[str, Config]:
 
 def _baselines() -> dict[str, Config]:
     """Other methods from the same pieces, with our accelerators: one engine, other models."""
-    # Appearance of these: one code per frame, no pose embedding and no fusion.
-    plain, one_way = UNLIT, LossConfig(consistency=0.0, offset=0.1)
-    instant = Config(preset="instant_nvr", loss=one_way, appearance=plain)
+    # UNLIT: one code per frame, no pose embedding and no fusion
+    one_way = LossConfig(consistency=0.0, offset=0.1)
+    instant = Config(preset="instant_nvr", loss=one_way, appearance=UNLIT)
     single = Config(
         preset="single_part",
         geometry=GeometryConfig(parts="single"),
         field=FieldConfig(log2_size=17),  # about the rows of five parts of 2^15
         deform=DeformConfig(input="xyzt"),
         loss=one_way,
-        appearance=plain,
+        appearance=UNLIT,
     )
     return {"instant_nvr": instant, "single_part": single}
 

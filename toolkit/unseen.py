@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from monopart.geometry.errors import MonopartError
+from monopart.geometry.mesh_graph import face_areas
 from monopart.geometry.parts import rows_of_parts
 from monopart.geometry.posed_parts import PosedParts, full_bary
 
@@ -25,10 +26,9 @@ class UnseenResiduals:
             canonical: the canonical body as the only body.
             count: places of a step.
         """
-        corners = canonical.verts[0][canonical.faces].double()
-        sides = corners[:, 1:] - corners[:, :1]
-        area = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=-1)
-        self.ends = (area.cumsum(0) / area.sum()).cpu()
+        verts, faces = (x.cpu().numpy() for x in (canonical.verts[0].double(), canonical.faces))
+        total = torch.from_numpy(face_areas(verts, faces)).cumsum(0)
+        self.ends = total / total[-1]
         self.canonical, self.count = canonical, count
 
     def loss(self, model: AvatarModel, generator: torch.Generator) -> Tensor:

@@ -19,7 +19,8 @@ from monopart.geometry.errors import InputError
 from monopart.tools.cli import main as mesh_program
 from monopart.tools.meshio import FORMATS
 
-from .publish import grid, write_section
+from .publish import grid
+from .sections import write_section
 from .suite import say
 from .timing import timed
 
@@ -154,7 +155,7 @@ def table(done: Sequence[Run]) -> str:
 def _cells(name: str, runs_by_command: Mapping[str, Run]) -> list[str]:
     facts = next((run.report["input"][0] for run in runs_by_command.values() if run.report), {})
     row = [name, str(facts.get("faces", "–"))]
-    for command in ("check", "unwrap", "partition", "remesh", "bake", "convert"):
+    for command in COMMANDS:
         run = runs_by_command.get(command)
         result = {} if run is None else run.report.get("result", {})
         row.append("–" if run is None else _words(command, result) or _CODES[run.code])

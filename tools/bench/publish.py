@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from monopart.geometry.atomic import write_text
 from monopart.geometry.errors import InputError
 
 from .results import Report, Row, Summary, Table, read_report, summarise, write_report
+from .sections import read_page, with_section
 from .show import cells, machine_line, main_size, seconds, table_plots
 
-BEGIN, END = "<!-- {}: begin -->", "<!-- {}: end -->"
 HEAD = ["method", "median", "IQR", "CPU", "× ours", "CPU × ours", "error", "also"]
 _KEPT = (1, 2, 4, 5, 6, 7, 8, 9)  # columns of `show.cells` that the page has
 
@@ -48,29 +49,6 @@ def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     return [*lines, *("| " + " | ".join(row) + " |" for row in rows), ""]
-
-
-def write_section(page: Path, name: str, text: str) -> None:
-    """Put a text into a page, between the marks of a suite.
-
-    Args:
-        page: a Markdown file with the marks.
-        name: of the suite.
-        text: what goes between them.
-
-    Raises:
-        InputError: no such page, or no marks.
-    """
-    try:
-        whole = page.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{page}: expected a Markdown page, found {error.strerror}") from None
-    begin, end = BEGIN.format(name), END.format(name)
-    if begin not in whole or end not in whole:
-        raise InputError(f"{page}: expected the marks {begin} and {end}; add them where it goes")
-    before, rest = whole.split(begin, 1)
-    after = rest.split(end, 1)[1]
-    page.write_text(f"{before}{begin}\n{text}{end}{after}", encoding="utf-8")
 
 
 def _compared(table: Table, summaries: list[Summary]) -> list[str]:
@@ -129,10 +107,7 @@ def publish(reports: Sequence[Path], page: Path) -> list[str]:
     Raises:
         InputError: no such page, no marks for a suite, a report of tiny problems, or no report.
     """
-    try:
-        text = page.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{page}: expected a Markdown page, found {error.strerror}") from None
+    text = read_page(page)
     folder = page.with_suffix("")
     read = [(path, read_report(path)) for path in reports or sorted(folder.glob("*.json"))]
     if not read:
@@ -141,19 +116,12 @@ def publish(reports: Sequence[Path], page: Path) -> list[str]:
         if report.quick:
             raise InputError(f"{path}: expected measurements, found a --quick run; run it in full")
         name = path.stem
-        begin, end = BEGIN.format(name), END.format(name)
-        if begin not in text or end not in text:
-            raise InputError(
-                f"{page}: expected the marks {begin} and {end}; add them where it goes"
-            )
-        before, rest = text.split(begin, 1)
-        after = rest.split(end, 1)[1]
-        text = f"{before}{begin}\n{section(report, name, folder.name)}{end}{after}"
+        text = with_section(text, page, name, section(report, name, folder.name))
     folder.mkdir(exist_ok=True)
     for path, report in read:
         write_report(report, folder / path.name, short=True)
         for table in report.tables:
             for file, plot in table_plots(report, path.stem, table).items():
                 (folder / file).write_text(plot, encoding="utf-8")
-    page.write_text(text, encoding="utf-8")
+    write_text(page, text)
     return [path.stem for path, _ in read]

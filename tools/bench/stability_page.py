@@ -10,12 +10,13 @@ import torch
 
 from monopart.geometry.errors import InputError
 
+from .sections import marks, write_section
 from .stability import ROOMS, chosen, run, write_json
 from .stability_cases import Cell, Outcome, Stress
 from .stability_heat import heat_map
 
 Rooms = Mapping[str, Sequence[Stress]]
-BEGIN, END = "<!-- stability: begin -->", "<!-- stability: end -->"
+BEGIN, END = marks("stability")
 FACTORS = {"quick": 0.1, "usual": 1.0, "exhaustive": 4.5}
 """Cases of a family, in those of a usual run."""
 PROMISED = {"blend_skin", "body", "project", "rays", "undistort", "closest_point"}
@@ -177,15 +178,7 @@ def publish(rooms: Rooms, outcome: Outcome, page: Path) -> None:
     Raises:
         InputError: no such page, or no marks in it.
     """
-    try:
-        text = page.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{page}: expected a Markdown page, found {error.strerror}") from None
-    if BEGIN not in text or END not in text:
-        raise InputError(f"{page}: expected the marks {BEGIN} and {END}; add them where it goes")
-    head, tail = text.split(BEGIN, 1)[0], text.split(END, 1)[1]
-    body = section(rooms, outcome, page.stem)
-    page.write_text(f"{head}{BEGIN}\n{body}{END}{tail}", encoding="utf-8")
+    write_section(page, "stability", section(rooms, outcome, page.stem))
     _write_maps(rooms, outcome, page.with_suffix(""))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from monopart.geometry.errors import InputError, MonopartError
+from monopart.geometry.errors import MonopartError
 from monopart.toolkit.avatar import Avatar
 from monopart.toolkit.captures import read_capture
 from monopart.toolkit.captures.cache import Pictures, read_pictures
@@ -20,7 +20,9 @@ from monopart.toolkit.config import Config
 from monopart.toolkit.presets import preset, with_overrides
 from monopart.toolkit.train import Trainer
 
-BEGIN, END = "<!-- stability-training: begin -->", "<!-- stability-training: end -->"
+from .sections import marks, read_page, with_section, write_section
+
+BEGIN, END = marks("stability-training")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,9 +219,8 @@ def command(capture: Path, seeds: int, steps: int, into: Path | None) -> None:
         steps: steps of a training.
         into: page with the marks of the table, or None.
     """
-    page = None if into is None else into.read_text(encoding="utf-8")
-    if page is not None and (BEGIN not in page or END not in page):
-        raise InputError(f"{into}: expected the lines {BEGIN} and {END}, found none; add them")
+    if into is not None:  # before the long run
+        with_section(read_page(into), into, "stability-training", "")
     setting, rows = setting_of(capture), []
     for name in CASES:
         for seed in range(seeds):
@@ -228,8 +229,5 @@ def command(capture: Path, seeds: int, steps: int, into: Path | None) -> None:
         print(f"{name}: {seeds - bad} of {seeds} as they should be", flush=True)
     text = f"`{capture.name}`, preset `fast`, {steps} steps, {seeds} seeds a case.\n\n{table(rows)}"
     print(text)
-    if into is not None and page is not None:
-        from monopart.geometry.atomic import write_text
-
-        head, rest = page.split(BEGIN)
-        write_text(into, f"{head}{BEGIN}\n\n{text}\n{END}{rest.split(END)[1]}")
+    if into is not None:
+        write_section(into, "stability-training", f"\n{text}\n")

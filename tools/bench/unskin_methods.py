@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from monopart.geometry.posed_parts import full_bary
 from monopart.geometry.skinning_field import SkinningField
 from monopart.geometry.surface import SurfaceHit
 
@@ -57,7 +58,7 @@ class PlainIndex:
     def query(self, points: Tensor, max_distance: float = math.inf) -> SurfaceHit:
         """As `SurfaceIndex.query`, without gradients."""
         face, two = (torch.from_numpy(a) for a in self.mesh.query_points(points.numpy()))
-        bary = torch.cat([two, 1.0 - two.sum(-1, keepdim=True)], -1)
+        bary = full_bary(two)
         face = face.long()
         point = (bary[..., None] * self.verts[self.faces[face]]).sum(1)
         distance = (points - point).norm(dim=-1)

@@ -12,9 +12,10 @@ from monopart.geometry.uv_mesh import MeshEdges
 from monopart.geometry.uv_mirror import seam_symmetry
 from monopart.geometry.uv_seams import Surface
 
-from .publish import grid, write_section
+from .publish import grid
 from .registry import Method, Operation, Problem, Settings
 from .results import Report, Row
+from .sections import write_section
 from .show import machine_line
 from .unwrap_meshes import MESHES, UnwrapData, torus
 
