@@ -15,8 +15,6 @@ import cv2
 import numpy as np
 import torch
 
-from monopart.geometry.body import BodyModel, PosedBody
-from monopart.geometry.cameras import Camera
 from monopart.geometry.parts import PartMap
 
 from .cache import NO_CACHE, Cache
@@ -24,8 +22,10 @@ from .captures.cache import Pictures, read_pictures
 from .captures.records import CaptureRecord
 from .config import Config, FieldConfig
 from .model import part_boxes
+from .part_picture import nearest_part, part_picture
+from .reach import reaching
 from .scene import canonical_body
-from .sizes import field_spec
+from .sizes import field_spec, part_radii
 
 IMAGES = 12  # training images that are looked at, evenly spread
 LEAST, MOST = 4, 3  # a level has at least 2^-4 and at most 2^3 times the uniform rows
@@ -60,35 +60,45 @@ def as_asked(stored: Config, wanted: Config) -> Config:
         part_log2_size=wanted.field.part_log2_size,
         part_finest=wanted.field.part_finest,
     )
-    return dataclasses.replace(stored, field=field)
+    shape = stored.geometry
+    if not wanted.geometry.part_radius:
+        shape = dataclasses.replace(shape, part_radius=())
+    return dataclasses.replace(stored, field=field, geometry=shape)
 
 
 def allocated(
     config: Config, record: CaptureRecord, pictures: Pictures | None = None, cache: Cache = NO_CACHE
 ) -> tuple[Config, list[dict[str, Any]]]:
-    """The configuration with the capacity of each part, and a row per part for people.
+    """The configuration with capacity and radius of each part, and a row per part for people.
 
     Args:
-        config: the configuration; one that holds the capacity already stays as it is.
+        config: the configuration; one that holds them already stays as it is.
         record: the capture.
         pictures: its training images where the caller has them.
         cache: where they are kept otherwise.
 
     Returns:
-        The configuration, and for each part its name, capacity and, where it was looked at, area
-        and detail.
+        The configuration, and for each part its name, radius, capacity and, where it was looked
+        at, area and detail.
     """
+    wants_capacity = config.field.allocation == "data" and not config.field.part_log2_size
+    wants_reach = config.geometry.reach == "masks" and not config.geometry.part_radius
+    if pictures is None and (wants_capacity or wants_reach):
+        pictures = read_pictures(record, "train", cache)
     spec, table = config.field, PartMap.preset(config.geometry.parts, record.body.num_joints)
+    if pictures is not None and wants_reach:
+        config = reaching(config, record, pictures, table)
     canonical = canonical_body(record)
-    lo, hi = part_boxes(record.body, canonical, table, config.geometry.canonical_margin)
+    lo, hi = part_boxes(record.body, canonical, table, config.geometry)
     edges, demand = (hi - lo).amax(-1).tolist(), None
-    if spec.allocation == "data" and not spec.part_log2_size:
-        pictures = pictures or read_pictures(record, "train", cache)
+    if pictures is not None and wants_capacity:
         demand = measured(record, pictures, table)
         sizes, cells = allocate(demand, edges, spec)
         spec = dataclasses.replace(spec, part_log2_size=sizes, part_finest=cells)
         config = dataclasses.replace(config, field=spec)
-    return config, _rows(spec, edges, table.names, demand)
+    radii = part_radii(config.geometry, len(edges))
+    rows = _rows(spec, edges, table.names, demand)
+    return config, [row | {"radius": r} for row, r in zip(rows, radii, strict=True)]
 
 
 def _rows(
@@ -174,7 +184,7 @@ def measured(record: CaptureRecord, pictures: Pictures, table: PartMap) -> Deman
             posed = record.body(record.poses[frame])
         drawn = part_picture(record.body, posed, record.cameras[camera], table)
         mask = pictures.masks[row].numpy()
-        label = np.where(mask, _spread(drawn), -1)
+        label = np.where(mask, nearest_part(drawn)[0], -1)
         inner = cv2.erode(mask.astype(np.uint8), np.ones((EDGE, EDGE), np.uint8)).astype(bool)
         texture = _texture(pictures.images[row].numpy())
         for k in range(len(table.names)):
@@ -198,58 +208,21 @@ def _texture(image: np.ndarray) -> np.ndarray:
     return np.hypot(right, down)
 
 
-def part_picture(body: BodyModel, posed: PosedBody, camera: Camera, table: PartMap) -> np.ndarray:
-    """The part that a camera sees at each pixel, -1 for none: faces drawn from far to near.
-
-    Args:
-        body: the body model.
-        posed: one posed body.
-        camera: the camera.
-        table: the parts.
-
-    Returns:
-        [H, W] int32.
-    """
-    pixels, depth = camera.project(posed.verts_world)
-    faces = body.faces.cpu()
-    corners, far = pixels.cpu()[faces], depth.cpu()[faces]
-    part = table.face_parts(body.weights, body.faces).cpu()
-    seen = (far > 0).all(-1)
-    order = torch.nonzero(seen).squeeze(-1)[far[seen].mean(-1).argsort(descending=True)]
-    picture = np.full(camera.size, -1, np.int32)
-    # sixteenths of a pixel; OpenCV counts from the centre of the first pixel
-    points = ((corners - 0.5).clamp(-1e4, 1e4) * 16).round().int().numpy()
-    for face, k in zip(order.tolist(), part[order].tolist(), strict=True):
-        cv2.fillConvexPoly(picture, points[face], k, shift=4)
-    return picture
-
-
-def _spread(picture: np.ndarray) -> np.ndarray:
-    """Every pixel gets the part of the nearest pixel that has one; -1 where none has."""
-    if not (picture >= 0).any():
-        return picture
-    _, label = cv2.distanceTransformWithLabels(
-        (picture < 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    known, nearest = picture >= 0, np.asarray(label, np.int64)
-    part_of = np.zeros(int(nearest.max()) + 1, np.int32)
-    part_of[nearest[known]] = picture[known]
-    return part_of[nearest]
-
-
 def capacity_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
     """The allocation as lines of text, one per part.
 
     Args:
         rows: from :func:`allocated`.
 
-    >>> capacity_lines([{"part": "head", "log2_size": 15, "finest": 0.002, "rows": 9}])
-    ['capacity head: 2^15 rows a level, 9 in all (100.0 %), finest cell 2.0 mm']
+    >>> row = {"part": "head", "log2_size": 15, "finest": 0.002, "rows": 9, "radius": 0.06}
+    >>> capacity_lines([row])
+    ['part head: reaches 60 mm; 2^15 rows a level, 9 in all (100.0 %), finest cell 2.0 mm']
     """
     total, lines = max(sum(row["rows"] for row in rows), 1), []
     for row in rows:
         text = (
-            f"capacity {row['part']}: 2^{row['log2_size']} rows a level, {row['rows']} in all "
+            f"part {row['part']}: reaches {1e3 * row['radius']:.0f} mm; "
+            f"2^{row['log2_size']} rows a level, {row['rows']} in all "
             f"({100 * row['rows'] / total:.1f} %), finest cell {1e3 * row['finest']:.1f} mm"
         )
         if "area" in row:

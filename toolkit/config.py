@@ -18,6 +18,11 @@ class GeometryConfig:
     """Table of parts (METHOD section 2)."""
     radius: float = 0.06
     """Largest distance of a sample from the surface of a part that it belongs to, metres."""
+    reach: Literal["radius", "masks"] = "radius"
+    """How far the parts reach: as the radius says, or as far as the masks of the training frames
+    stand out from the body, where that is more (up to twice the radius)."""
+    part_radius: tuple[float, ...] = ()
+    """Radius of each part, metres; filled in from the masks."""
     voxel: float = 0.02
     """Edge of the shell's voxels, metres; changes the speed, never the image."""
     step: float = 0.0125

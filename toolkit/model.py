@@ -23,10 +23,10 @@ from monopart.geometry.posed_parts import PartPairs, PosedParts, RestPoints
 from monopart.geometry.stages import stage
 
 from .appearance import Appearance, FrameInput, fuses
-from .config import Config, DeformConfig
+from .config import Config, DeformConfig, GeometryConfig
 from .corrections import PoseCorrections
 from .light import Light
-from .sizes import field_spec
+from .sizes import field_spec, part_radii
 from .skipping import EVERY, Skipping
 
 HIDDEN = 10.0  # optical depth in front of a sample that hides it: 5e-5 of the light is left
@@ -130,7 +130,7 @@ class AvatarModel(torch.nn.Module):
         self.config = config
         self.parts = PartMap.preset(config.geometry.parts, body.num_joints)
         self.num_parts = len(self.parts.names)
-        lo, hi = part_boxes(body, canonical, self.parts, config.geometry.canonical_margin)
+        lo, hi = part_boxes(body, canonical, self.parts, config.geometry)
         spec, deform = config.field, config.deform
         self.light = Light(cameras) if config.appearance.light and cameras else None
         sizes = field_spec(spec, self.num_parts, config.appearance, self.light is not None)
@@ -348,14 +348,16 @@ def distance(out: Composite) -> Tensor:
 
 
 def part_boxes(
-    body: BodyModel, canonical: PosedBody, parts: PartMap, margin: float
+    body: BodyModel, canonical: PosedBody, parts: PartMap, spec: GeometryConfig
 ) -> tuple[Tensor, Tensor]:
     """Canonical box of each part's faces with a margin, metres: lower and upper corners [K, 3]."""
     face_part = parts.face_parts(body.weights, body.faces)
+    beyond = spec.canonical_margin - spec.radius  # room for residuals
+    margins = [radius + beyond for radius in part_radii(spec, len(parts.names))]
     lo, hi = [], []
     for part in range(len(parts.names)):
         used = body.faces[face_part == part].unique()
         corners = canonical.verts[used] if len(used) else canonical.verts.mean(0, keepdim=True)
-        lo.append(corners.amin(0) - margin)
-        hi.append(corners.amax(0) + margin)
+        lo.append(corners.amin(0) - margins[part])
+        hi.append(corners.amax(0) + margins[part])
     return torch.stack(lo), torch.stack(hi)

@@ -19,6 +19,7 @@ from monopart.geometry.parts import PartMap
 
 from .cache import NO_CACHE, Cache, Tensors
 from .config import GeometryConfig
+from .sizes import part_radii
 
 REACH, CELL = 0.12, 0.01
 """Distance beyond which the prior is constant, and the edge of its cells, metres."""
@@ -73,14 +74,14 @@ def body_shell(
     verts = posed.verts.detach().reshape(-1, body.num_verts, 3).float()
     faces = body.faces.to(verts.device)
     owner = table.face_parts(body.weights, body.faces).to(verts.device)
-    radius = torch.full((table.num_parts,), spec.radius, device=verts.device)
+    radius = torch.tensor(part_radii(spec, table.num_parts), device=verts.device)
 
     def build(grid: Tensor | None = None) -> BodyShell:
         return BodyShell(verts, faces, radius, owner, spec.voxel, grid)
 
     return cache.fetch(
         "shell",
-        (verts, faces, owner, spec.radius, spec.voxel, *_code(verts)),
+        (verts, faces, owner, radius, spec.voxel, *_code(verts)),
         build,
         lambda shell: {"bits": narrowed(shell.grid, table.num_parts).cpu()},
         lambda tensors: build(tensors["bits"].to(verts.device).int()),

@@ -18,6 +18,7 @@ from .corrections import PoseCorrections
 from .memory import PoseMemory
 from .model import FrameInput
 from .scene import SceneBodies, stack_poses
+from .sizes import part_radii
 
 
 @dataclass(frozen=True)
@@ -87,8 +88,9 @@ class RefinedPoses:
         shells = [self._shell(row, v) for row, v in zip(numbers, verts, strict=True)]
         shell = BodyShell.joined(shells)
         if len(rows) not in self._parts:
-            canonical, radius = self.avatar.canonical, self.avatar.config.geometry.radius
-            made = PosedParts(body, posed, canonical, self.table, radius, shell)
+            made = PosedParts(
+                body, posed, self.avatar.canonical, self.table, self._radii(verts), shell
+            )
             self._parts[len(rows)] = made
         parts = MovingParts.like(self._parts[len(rows)], body, posed, shell)
         frames = tuple(self.frames[row] for row in numbers)
@@ -97,12 +99,16 @@ class RefinedPoses:
         chosen = inputs.of(rows)
         return Posing(SceneBodies(posed, parts, frames), chosen, place)
 
+    def _radii(self, like: Tensor) -> Tensor:
+        radii = part_radii(self.avatar.config.geometry, self.table.num_parts)
+        return torch.tensor(radii, device=like.device)
+
     def _shell(self, row: int, verts: Tensor) -> BodyShell:
         spec, margin = self.avatar.config.geometry, self.avatar.config.refine.margin
         kept = self._shells.get(row)
         if kept is not None and bool((verts - kept[0]).square().sum(-1).amax() <= margin**2):
             return kept[1]
-        radius = torch.full((self.table.num_parts,), spec.radius + margin, device=verts.device)
+        radius = self._radii(verts) + margin
         faces = self.avatar.record.body.faces.to(verts.device)
         owner = self.face_part.to(verts.device)
         shell = BodyShell(verts, faces, radius, owner, spec.voxel)

@@ -72,7 +72,7 @@ def _of(row: Mapping[str, Any], key: str, unit: float) -> float | None:
 
 
 def capacity_section(parts: Sequence[Mapping[str, Any]]) -> str:
-    """The size of each part's field; nothing where it is not known.
+    """Reach and size of each part's field; nothing where they are not known.
 
     Args:
         parts: rows of training.json.
@@ -84,6 +84,7 @@ def capacity_section(parts: Sequence[Mapping[str, Any]]) -> str:
     rows = []
     for part in parts:
         cells = [
+            f"{1e3 * part['radius']:.0f}",
             f"2^{part['log2_size']}",
             f"{part['rows']}",
             f"{100 * part['rows'] / total:.1f} %",
@@ -93,7 +94,7 @@ def capacity_section(parts: Sequence[Mapping[str, Any]]) -> str:
             cells += [f"{part.get('area', 0.0):.0f}", f"{part.get('detail', 0.0):.4f}"]
         numbers = "".join(f'<td class="n">{escape(cell)}</td>' for cell in cells)
         rows.append(f'<tr><td class="name">{escape(part["part"])}</td>{numbers}</tr>')
-    head = ["Rows a level", "Rows", "Share", "Finest cell, mm"]
+    head = ["Reaches, mm", "Rows a level", "Rows", "Share", "Finest cell, mm"]
     head += ["Pixels an image", "Detail"] if looked else []
     body = table([("Part", False), *((text, True) for text in head)], rows)
     lead = "Hash table of each part" + (

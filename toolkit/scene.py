@@ -68,7 +68,7 @@ class SceneBodies:
             posed = body(poses)
             table = PartMap.preset(spec.parts, body.num_joints)
             shell = body_shell(body, posed, table, spec, cache)
-            parts = PosedParts(body, posed, canonical, table, spec.radius, shell)
+            parts = PosedParts(body, posed, canonical, table, shell.radius, shell)
         return cls(posed, parts, frames)
 
     def local_rays(self, rays: Rays, body: Tensor | int) -> Rays:

@@ -70,9 +70,8 @@ class Trainer:
             self.refined = RefinedPoses(avatar, train.frames, avatar.model.corrections)
         self.body_of_image = torch.tensor([train.frames.index(f) for _, f in train.pairs()])
         self.camera_of_image = torch.tensor([train.cameras.index(c) for c, _ in train.pairs()])
-        host = torch.zeros(())
         # The host draws batches, and so the same ones for every device; see `sent`.
-        cameras = [avatar.record.cameras[c].to(host) for c in train.cameras]
+        cameras = [avatar.record.cameras[c].to(torch.zeros(())) for c in train.cameras]
         heads = self._heads() if self.config.train.head_focus else None
         self.looks = Looks(seen, cameras, heads, self.config.train)
         self.look = self.looks.at(0.0)
@@ -80,7 +79,8 @@ class Trainer:
         self.objective = Objective(self.config, avatar.canonical_parts() if asked else None)
         self.generator = torch.Generator().manual_seed(self.config.seed)
         doubts = picture_doubts(avatar.record, seen, self.config.train.patch)
-        if self.config.appearance.light:
+        if avatar.model.light is not None:
+            avatar.model.light.center(self.scene.parts)
             doubts += heading_doubts(avatar.record)
         self.result = TrainResult(warnings=doubts + preset_doubts(self.config))
         self.lpips = self._load_lpips()

@@ -17,12 +17,12 @@ from monopart.toolkit.capacity import (
     allocated,
     capacity_lines,
     measured,
-    part_picture,
 )
 from monopart.toolkit.captures import read_capture
 from monopart.toolkit.captures.cache import read_pictures
 from monopart.toolkit.config import FieldConfig
 from monopart.toolkit.overrides import overridden
+from monopart.toolkit.part_picture import part_picture
 from monopart.toolkit.presets import preset
 from monopart.toolkit.sizes import field_spec
 from monopart.toolkit.train import Trainer

@@ -29,7 +29,7 @@ def test_the_sections_show_what_was_recorded() -> None:
     moments = [{"iteration": 7, "share": 0.25, "histogram": share}]
     page = round_trips_section(rows, moments)
     assert page.count("<svg") == 3 and "step 7: 100" in page and "No drawable value" in page
-    part = {"part": "le<ft", "log2_size": 14, "finest": 0.0025, "rows": 300}
+    part = {"part": "le<ft", "log2_size": 14, "finest": 0.0025, "rows": 300, "radius": 0.08}
     seen = {"part": "head", "rows": 100, "area": 12.0, "detail": 0.5}
     page = capacity_section([part, part | seen])
     assert "le&lt;ft" in page and "75.0 %" in page and "2^14" in page and "0.5000" in page
