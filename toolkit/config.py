@@ -85,6 +85,8 @@ class DeformConfig:
     """Standard deviation of the noise on the times of a training step, in frames."""
     lr: float = 1.0
     """Factor of the learning rates of the residuals."""
+    start: float = 0.0
+    """Part of the run after which residuals begin: until then skinning alone, which costs less."""
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,13 @@ def _baselines() -> dict[str, Config]:
 
 def _presets() -> dict[str, Config]:
     fast = Config(preset="fast")
-    best = Config(preset="best", train=TrainConfig(seconds=1680.0))
+    # Light says what a code of the frame would; residuals want an avatar to move.
+    best = Config(
+        preset="best",
+        deform=DeformConfig(start=0.6),
+        appearance=AppearanceConfig(code=0),
+        train=TrainConfig(seconds=1680.0),
+    )
     tiny = Config(preset="tiny", train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0))
     rigid = Config(preset="rigid", appearance=UNLIT, deform=DeformConfig(residual=False))
     full = Config(preset="full", appearance=dataclasses.replace(UNLIT, pose_feature=True))

@@ -79,8 +79,7 @@ class Trainer:
         self.objective = Objective(self.config, avatar.canonical_parts() if asked else None)
         self.generator = torch.Generator().manual_seed(self.config.seed)
         doubts = picture_doubts(avatar.record, seen, self.config.train.patch)
-        if avatar.model.light is not None:
-            avatar.model.light.center(self.scene.parts)
+        if self.config.appearance.light:
             doubts += heading_doubts(avatar.record)
         self.result = TrainResult(warnings=doubts + preset_doubts(self.config))
         self.lpips = self._load_lpips()
@@ -254,10 +253,9 @@ class Trainer:
         """Choose the bodies of a step: all as they are given, or those of the batch, corrected."""
         inputs = self._inputs()
         self.posing = dataclasses.replace(self.everyone, inputs=inputs)
-        if self.refined is None:
-            return
-        self.avatar.model.rigid = done < self.config.refine.rigid
-        if self._refines(done):
+        first = 0.0 if self.refined is None else self.config.refine.rigid
+        self.avatar.model.rigid = done < max(first, self.config.deform.start)
+        if self.refined is not None and self._refines(done):
             with stage("poses"):
                 seen = self.body_of_image[batch.image].unique()
                 self.posing = self.refined.posing(sent(seen, self.avatar.device), inputs)

@@ -153,27 +153,6 @@ def test_light_is_unknown_where_no_camera_looked(capture: Path) -> None:
     assert torch.equal(dark, torch.cat([code, torch.zeros(len(face), 8)], 1))
 
 
-def test_light_is_counted_from_the_mean_of_what_was_seen(capture: Path) -> None:
-    trainer = Trainer(make(capture, config(light=True, pose_feature=False)))
-    light, bodies = trainer.avatar.model.light, trainer.scene.parts
-    assert light is not None
-    # the oracle: face by face, each as large as the camera sees it, light at its middle
-    total, weight = torch.zeros(8, dtype=torch.float64), 0.0
-    camera = trainer.avatar.record.cameras[0]
-    for b, verts in enumerate(bodies.verts.double()):
-        world = verts @ bodies.rotation[b].double().T + bodies.translation[b].double()
-        corners = world[bodies.faces]
-        cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal = torch.nn.functional.normalize(cross, dim=-1)
-        towards = torch.nn.functional.normalize(camera.center - bodies.translation[b], dim=0)
-        size = cross.norm(dim=-1) * (normal @ towards.double()).clamp_min(0.0)
-        total += (irradiance_basis(normal @ camera.R.double().T) * size[:, None]).sum(0)
-        weight += float(size.sum())
-    torch.testing.assert_close(light.mean.double(), total / weight, atol=0.03, rtol=0.0)
-    assert float(light.mean[2]) < -0.5, "what a camera sees looks at it, against its z axis"
-    assert "light.mean" in trainer.avatar.model.state_dict(), "a run is read back with its mean"
-
-
 def test_a_step_leaves_out_the_light_of_some_frames(capture: Path) -> None:
     for share, least, most in ((0.0, 1.0, 1.0), (0.25, 0.65, 0.85), (1.0, 0.0, 0.0)):
         trainer = Trainer(make(capture, config(light_out=share)))
