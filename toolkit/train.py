@@ -350,7 +350,9 @@ class Trainer:
     def _record_round_trips(self, done: float) -> None:
         """Keep a histogram where the next part of the run has begun, and at the end."""
         found, kept = self.objective.round_trips, self.result.round_trips
-        if found is not None and len(kept) <= int(done * MOMENTS):
+        begun = self.config.deform.start
+        active = (done - begun) / (1.0 - begun) if begun < 1.0 else 0.0
+        if found is not None and len(kept) <= int(active * MOMENTS):
             threshold = self.config.loss.consistency_threshold
             kept.append(moment(found, threshold, self.result.iterations))
 

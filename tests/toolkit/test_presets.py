@@ -155,6 +155,29 @@ def test_the_residuals_have_a_rate_of_their_own(small_capture: Path) -> None:
         assert rate == full * (0.5 if "residual" in name else 1.0), name
 
 
+def test_residuals_begin_when_they_are_told_to(small_capture: Path) -> None:
+    assert preset("best").deform.start > 0 == preset("full").deform.start
+    trainer = make(small_capture, small(preset("fast"), "deform.start=0.5"))
+    model, field = trainer.avatar.model, trainer.avatar.model.backward_residual
+    assert field is not None and trainer.objective.round_trips is None
+    first = [p.detach().clone() for p in field.parameters()]
+
+    def moved() -> bool:
+        return any(not torch.equal(a, b) for a, b in zip(field.parameters(), first, strict=True))
+
+    numbers = trainer.step(0, 0.4)
+    assert "consistency" not in numbers and field.grid.table.grad is None
+    assert not moved() and trainer.objective.round_trips is None
+    numbers = trainer.step(1, 0.5)
+    assert "consistency" in numbers and moved()
+    for done in (0.5, 0.51, 0.52, 0.9):
+        trainer._record_round_trips(done)
+    assert len(trainer.result.round_trips) == 2, "the histograms cover the part with residuals"
+    trainer.step(2, 0.0)
+    trainer.finish()
+    assert not model.rigid, "what is rendered has them"
+
+
 def test_times_get_noise_in_training_only(small_capture: Path) -> None:
     trainer = make(small_capture, small(preset("fast"), "deform.time_jitter=2"))
     exact = trainer.avatar.training_input().time
