@@ -54,6 +54,20 @@ def blended(table: wp.array2d(dtype=wp.vec4), row: int, v: wp.vec3i, w: wp.vec3)
 
 
 @no_type_check
+@wp.func
+def of_body(corners: wp.vec3i, first: int):
+    """The corners of a face among the vertices of all bodies, where those of its body begin."""
+    return wp.vec3i(corners[0] + first, corners[1] + first, corners[2] + first)
+
+
+@no_type_check
+@wp.func
+def all_three(bary: wp.vec2):
+    """All barycentrics from the first two."""
+    return wp.vec3(bary[0], bary[1], 1.0 - bary[0] - bary[1])
+
+
+@no_type_check
 @wp.kernel
 def unskin_pairs(
     start: int,
@@ -80,12 +94,9 @@ def unskin_pairs(
     i = start + wp.tid()
     s = sample[i]
     f = int(face[i])
-    u = bary[i][0]
-    v = bary[i][1]
-    w = wp.vec3(u, v, 1.0 - u - v)
+    w = all_three(bary[i])
     tri = faces[f]
-    base = body[s] * num_verts
-    posed_tri = wp.vec3i(tri[0] + base, tri[1] + base, tri[2] + base)
+    posed_tri = of_body(tri, body[s] * num_verts)
     a0 = blended(posed_maps, 0, posed_tri, w)
     a1 = blended(posed_maps, 1, posed_tri, w)
     a2 = blended(posed_maps, 2, posed_tri, w)
@@ -125,9 +136,7 @@ def interpolate_rows(
 ):
     """Values of the vertices of many bodies, four numbers at a time, on points of their faces."""
     i = start + wp.tid()
-    w = bary[i]
-    tri = faces[int(face[i])]
-    base = int(body[i]) * num_verts
-    corners = wp.vec3i(tri[0] + base, tri[1] + base, tri[2] + base)
+    w = all_three(bary[i])
+    corners = of_body(faces[int(face[i])], int(body[i]) * num_verts)
     for k in range(out.shape[1]):
-        out[i, k] = blended(table, k, corners, wp.vec3(w[0], w[1], 1.0 - w[0] - w[1]))
+        out[i, k] = blended(table, k, corners, w)
