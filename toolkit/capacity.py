@@ -19,6 +19,7 @@ from monopart.geometry.parts import PartMap
 
 from .cache import NO_CACHE, Cache
 from .captures.cache import Pictures, read_pictures
+from .captures.frames import spread
 from .captures.records import CaptureRecord
 from .config import Config, FieldConfig
 from .model import part_boxes
@@ -175,11 +176,9 @@ def measured(record: CaptureRecord, pictures: Pictures, table: PartMap) -> Deman
         pictures: its training images.
         table: the parts.
     """
-    pairs = record.split("train").pairs()
-    count = min(IMAGES, len(pairs))
+    chosen = spread([*enumerate(record.split("train").pairs())], IMAGES)
     area, change, inside = np.zeros((3, len(table.names)))
-    for row in (i * len(pairs) // count for i in range(count)):
-        camera, frame = pairs[row]
+    for row, (camera, frame) in chosen:
         with torch.no_grad():
             posed = record.body(record.poses[frame])
         drawn = part_picture(record.body, posed, record.cameras[camera], table)
@@ -188,7 +187,7 @@ def measured(record: CaptureRecord, pictures: Pictures, table: PartMap) -> Deman
         inner = cv2.erode(mask.astype(np.uint8), np.ones((EDGE, EDGE), np.uint8)).astype(bool)
         texture = _texture(pictures.images[row].numpy())
         for k in range(len(table.names)):
-            area[k] += (label == k).sum() / count
+            area[k] += (label == k).sum() / len(chosen)
             change[k] += texture[inner & (label == k)].sum()
             inside[k] += (inner & (label == k)).sum()
     # A part so thin that all of it is outline counts as the others do.

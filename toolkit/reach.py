@@ -12,6 +12,7 @@ import torch
 from monopart.geometry.parts import PartMap
 
 from .captures.cache import Pictures
+from .captures.frames import spread
 from .captures.records import CaptureRecord
 from .config import Config
 from .part_picture import nearest_part, part_picture
@@ -54,14 +55,12 @@ def measured_reach(
     Returns:
         Radii between ``radius`` and ``MOST`` times it, metres, rounded to millimetres.
     """
-    pairs = record.split("train").pairs()
-    count = min(IMAGES, len(pairs))
     outside: list[list[np.ndarray]] = [[] for _ in table.names]
     total = 0
-    for row in (i * len(pairs) // count for i in range(count)):
+    for row, (camera, frame) in spread([*enumerate(record.split("train").pairs())], IMAGES):
         mask = pictures.masks[row].numpy()
         total += int(mask.sum())
-        for part, far in enumerate(_distances(record, *pairs[row], mask, table)):
+        for part, far in enumerate(_distances(record, camera, frame, mask, table)):
             outside[part].append(far[(far > radius) & (far < MOST * radius)])
     return tuple(_radius(np.concatenate(far), total, radius) for far in outside)
 

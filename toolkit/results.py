@@ -13,6 +13,7 @@ from monopart.geometry.errors import InputError
 from .atomic import write_json, write_text
 from .avatar import Avatar
 from .captures import CaptureRecord
+from .captures.frames import spread
 from .environment import environment_facts, peak_memory_bytes
 from .evaluate import SHAPE, Evaluation, evaluate_split, images_csv
 from .explain import module_rows, print_skipping, skip_rows
@@ -176,16 +177,6 @@ def report_refit(run: Path, avatar: Avatar, evaluations: Sequence[Evaluation], w
         facts = [dataclasses.asdict(row) for row in rows]
         write_json(run / "refit.json", {"rows": facts}, nonfinite="null")
     print(refit_table(rows))
-
-
-def spread(pairs: list[tuple[int, int]], count: int) -> list[tuple[int, int]]:
-    """At most ``count`` evenly spaced elements.
-
-    >>> spread([(0, 0), (0, 1), (1, 0), (1, 1)], 2)
-    [(0, 0), (1, 0)]
-    """
-    count = min(count, len(pairs))
-    return [pairs[i * len(pairs) // count] for i in range(count)]
 
 
 def write_scores(run: Path, record: CaptureRecord, evaluations: Sequence[Evaluation]) -> None:

@@ -11,6 +11,7 @@ import torch
 from monopart.toolkit import cli, results
 from monopart.toolkit.avatar import view_of
 from monopart.toolkit.captures import describe, read_capture
+from monopart.toolkit.captures.frames import spread
 from monopart.toolkit.evaluate import evaluate_split, images_csv
 from monopart.toolkit.lpips import load_lpips
 from monopart.toolkit.protocols import SPLITS
@@ -105,8 +106,8 @@ def test_perfect_images_do_not_break_the_metrics(trained_run, tmp_path):
 
 def test_spread():
     pairs = [(0, i) for i in range(10)]
-    assert results.spread(pairs, 3) == [(0, 0), (0, 3), (0, 6)]
-    assert results.spread(pairs, 99) == pairs
+    assert spread(pairs, 3) == [(0, 0), (0, 3), (0, 6)]
+    assert spread(pairs, 99) == pairs
 
 
 def test_facts_of_a_capture(small_capture):

@@ -1,13 +1,17 @@
 """Which pictures there are: the files of one, and the cameras and frames of a split."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from monopart.geometry.errors import InputError
 
 from .images import describe_size
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -67,3 +71,17 @@ def check_sizes(entry: Frame, rgb: np.ndarray, on: np.ndarray, size: tuple[int, 
             f"{entry.mask_path}: expected {describe_size(size)} as its image, found "
             f"{describe_size(on.shape)}; resize the mask (nearest neighbour)"
         )
+
+
+def spread(items: Sequence[T], count: int) -> list[T]:
+    """At most ``count`` evenly spaced elements.
+
+    Args:
+        items: all of them.
+        count: how many at most.
+
+    >>> spread([(0, 0), (0, 1), (1, 0), (1, 1)], 2)
+    [(0, 0), (1, 0)]
+    """
+    count = min(count, len(items))
+    return [items[i * len(items) // count] for i in range(count)]
