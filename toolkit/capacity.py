@@ -48,20 +48,15 @@ class Demand:
 
 
 def as_asked(stored: Config, wanted: Config) -> Config:
-    """A run's configuration as it was asked for: without capacities that were measured.
+    """A run's configuration as it was asked for: without what was measured of the parts.
 
     Args:
         stored: of a run folder.
-        wanted: what it is compared with; capacities that it names itself are kept.
+        wanted: what it is compared with; capacities and radii that it names itself are kept.
     """
-    if wanted.field.part_log2_size or wanted.field.part_finest:
-        return stored
-    field = dataclasses.replace(
-        stored.field,
-        part_log2_size=wanted.field.part_log2_size,
-        part_finest=wanted.field.part_finest,
-    )
-    shape = stored.geometry
+    field, shape = stored.field, stored.geometry
+    if not (wanted.field.part_log2_size or wanted.field.part_finest):
+        field = dataclasses.replace(field, part_log2_size=(), part_finest=())
     if not wanted.geometry.part_radius:
         shape = dataclasses.replace(shape, part_radius=())
     return dataclasses.replace(stored, field=field, geometry=shape)
@@ -82,17 +77,15 @@ def allocated(
         The configuration, and for each part its name, radius, capacity and, where it was looked
         at, area and detail.
     """
-    wants_capacity = config.field.allocation == "data" and not config.field.part_log2_size
-    wants_reach = config.geometry.reach == "masks" and not config.geometry.part_radius
-    if pictures is None and (wants_capacity or wants_reach):
-        pictures = read_pictures(record, "train", cache)
     spec, table = config.field, PartMap.preset(config.geometry.parts, record.body.num_joints)
-    if pictures is not None and wants_reach:
+    if config.geometry.reach == "masks" and not config.geometry.part_radius:
+        pictures = pictures or read_pictures(record, "train", cache)
         config = reaching(config, record, pictures, table)
     canonical = canonical_body(record)
     lo, hi = part_boxes(record.body, canonical, table, config.geometry)
     edges, demand = (hi - lo).amax(-1).tolist(), None
-    if pictures is not None and wants_capacity:
+    if spec.allocation == "data" and not spec.part_log2_size:
+        pictures = pictures or read_pictures(record, "train", cache)
         demand = measured(record, pictures, table)
         sizes, cells = allocate(demand, edges, spec)
         spec = dataclasses.replace(spec, part_log2_size=sizes, part_finest=cells)

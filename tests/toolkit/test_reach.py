@@ -97,6 +97,9 @@ def test_a_run_keeps_the_radii_that_were_measured(record: CaptureRecord) -> None
     assert f"reaches {1e3 * radii[HEAD]:.0f} mm" in capacity_lines(rows)[HEAD]
     assert allocated(filled, record)[0] is filled, "what is there already is not measured again"
     assert as_asked(filled, config) == config and as_asked(filled, filled) == filled
+    sizes = overridden(config, ("field.part_log2_size=8,8,8,8,8",))
+    measured = dataclasses.replace(sizes, geometry=filled.geometry)
+    assert as_asked(measured, sizes) == sizes, "capacities that are named keep no radii"
     avatar = Avatar.create(read_capture(record.root), filled)
     assert avatar.scene((0,)).parts.radius.tolist() == pytest.approx(list(radii))
     plain = Avatar.create(avatar.record, dataclasses.replace(filled, geometry=GeometryConfig()))
