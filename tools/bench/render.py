@@ -61,13 +61,12 @@ def view_problems(settings: Settings, opened: Callable[[Settings], Any]) -> Iter
     import dataclasses
 
     from monopart.toolkit.avatar import view_of
+    from monopart.toolkit.captures.frames import spread
 
     avatar = opened(settings)
     record = avatar.record
     name = "novel_view" if "novel_view" in record.splits else "train"
-    pairs = record.split(name).pairs()
-    count = 1 if settings.quick else min(VIEWS, len(pairs))
-    for camera, frame in (pairs[i * len(pairs) // count] for i in range(count)):
+    for camera, frame in spread(record.split(name).pairs(), 1 if settings.quick else VIEWS):
         view = view_of(record, camera, frame)
         if settings.quick:
             view = dataclasses.replace(view, camera=view.camera.resized((24, 24)))
