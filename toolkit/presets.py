@@ -87,6 +87,7 @@ def _presets() -> dict[str, Config]:
         preset="best",
         deform=DeformConfig(start=0.6),
         appearance=AppearanceConfig(code=0),
+        loss=LossConfig(lpips=0.05),
         train=TrainConfig(seconds=1680.0),
     )
     tiny = Config(preset="tiny", train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0))
