@@ -64,13 +64,16 @@ def overridden(config: Config, settings: Sequence[str]) -> Config:
 
     Args:
         config: where to start from.
-        settings: texts such as ``train.rays=512``; later ones win.
+        settings: texts such as ``train.rays=512``; later ones win. ``refine.poses=true`` brings
+            ``appearance.light=false`` with it where light is not set: it explains wrong poses.
 
     Raises:
         InputError: a text of another form, an unknown entry, a value of another type.
 
     >>> overridden(Config(), ["train.rays=512"]).train.rays
     512
+    >>> overridden(Config(), ["refine.poses=true"]).appearance.light
+    False
     """
     sections: dict[str, dict[str, Any]] = {}
     known = {
@@ -105,6 +108,8 @@ def overridden(config: Config, settings: Sequence[str]) -> Config:
                 "correct the value"
             ) from None
         sections.setdefault(section, {})[entry] = value
+    if sections.get("refine", {}).get("poses"):
+        sections.setdefault("appearance", {}).setdefault("light", False)
     return with_overrides(config, **sections)
 
 

@@ -122,9 +122,15 @@ def preset_doubts(config: Config) -> list[str]:
         config: a configuration, which names its preset.
 
     Returns:
-        One sentence for each learning rate that is `FASTER` times the preset's or more.
+        One sentence for each learning rate that is `FASTER` times the preset's or more, and one
+        where light and poses are learned together.
     """
     usual, found = _presets().get(config.preset, Config()).train, []
+    if config.refine.poses and config.appearance.light:
+        found.append(
+            "poses are learned (refine.poses) and light too (appearance.light), which explains "
+            "wrong poses instead of correcting them: --set appearance.light=false leaves it out."
+        )
     for name in ("lr_table", "lr_network"):
         rate, known = getattr(config.train, name), getattr(usual, name)
         if rate >= FASTER * known:

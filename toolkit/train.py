@@ -23,7 +23,7 @@ from .determinism import repeatable
 from .device import sent
 from .guard import gradients_are_finite
 from .lpips import LPIPS, load_lpips
-from .model import FrameInput, Rendered
+from .model import Rendered
 from .objective import Objective, seen_batch
 from .optimizer import make_optimizer
 from .presets import preset_doubts
@@ -33,6 +33,7 @@ from .resume import forget_state, save_state
 from .round_trips import MOMENTS, figures, moment
 from .schedule import Looks, head_box
 from .skipping import EVERY
+from .step_inputs import StepInputs
 from .train_result import TrainResult
 
 PRUNE = 2e-3  # absorption of a step below which a canonical cell counts as empty in training
@@ -78,6 +79,7 @@ class Trainer:
         asked = self.config.loss.consistency or self.config.loss.unseen
         self.objective = Objective(self.config, avatar.canonical_parts() if asked else None)
         self.generator = torch.Generator().manual_seed(self.config.seed)
+        self.inputs = StepInputs(avatar, self.generator)
         doubts = picture_doubts(avatar.record, seen, self.config.train.patch)
         if self.config.appearance.light:
             doubts += heading_doubts(avatar.record)
@@ -147,28 +149,6 @@ class Trainer:
             prune=0.0 if self.is_probe(step) or not self.skip.cells else PRUNE,
             skip=self.skip,
         )
-
-    def _inputs(self) -> FrameInput:
-        """Times and codes of the training frames; times with the noise that is asked for."""
-        spec = self.config.appearance
-        left_out = None if self.avatar.memory.parts is None else self._drawn(spec.leave_out)
-        inputs = self.avatar.training_input(left_out)
-        unlit = self._drawn(spec.light_out) if spec.light else None
-        if unlit is not None:
-            inputs = dataclasses.replace(inputs, lit=(~unlit).float())
-        jitter = self.config.deform.time_jitter
-        if not jitter:
-            return inputs
-        frames = len(inputs.time)
-        noise = torch.randn(frames, generator=self.generator) * jitter / max(frames - 1, 1)
-        return dataclasses.replace(inputs, time=inputs.time + sent(noise, inputs.time.device))
-
-    def _drawn(self, share: float) -> Tensor | None:
-        """A share of the training frames, drawn for one step; None where it is zero."""
-        if not share:
-            return None
-        drawn = torch.rand(len(self.scene.frames), generator=self.generator)
-        return sent(drawn < share, self.avatar.device)
 
     def is_probe(self, step: int) -> bool:
         """Whether a step evaluates learned empty cells too, which refreshes them."""
@@ -251,7 +231,7 @@ class Trainer:
 
     def _pose(self, batch: PixelBatch, done: float) -> None:
         """Choose the bodies of a step: all as they are given, or those of the batch, corrected."""
-        inputs = self._inputs()
+        inputs = self.inputs()
         self.posing = dataclasses.replace(self.everyone, inputs=inputs)
         first = 0.0 if self.refined is None else self.config.refine.rigid
         self.avatar.model.rigid = done < max(first, self.config.deform.start)

@@ -156,10 +156,10 @@ def test_light_is_unknown_where_no_camera_looked(capture: Path) -> None:
 def test_a_step_leaves_out_the_light_of_some_frames(capture: Path) -> None:
     for share, least, most in ((0.0, 1.0, 1.0), (0.25, 0.65, 0.85), (1.0, 0.0, 0.0)):
         trainer = Trainer(make(capture, config(light_out=share)))
-        drawn = [trainer._inputs().lit for _ in range(100)]
+        drawn = [trainer.inputs().lit for _ in range(100)]
         mean = sum(1.0 if lit is None else float(lit.mean()) for lit in drawn) / 100
         assert least <= mean <= most
-    assert Trainer(make(capture, config(light=False)))._inputs().lit is None
+    assert Trainer(make(capture, config(light=False))).inputs().lit is None
 
 
 @pytest.mark.parametrize(("degrees", "said"), [(40.0, True), (80.0, False), (350.0, True)])
@@ -221,7 +221,7 @@ def test_training_leaves_the_own_frame_out_at_the_rate_that_is_asked_for(capture
         count = len(trainer.scene.frames)
         hits = 0
         for _ in range(100):
-            rows = trainer._inputs().rows
+            rows = trainer.inputs().rows
             assert rows is not None
             hits += int((rows[..., 0] == torch.arange(count)[:, None]).all(1).sum())
         own[share] = hits / (100 * count)

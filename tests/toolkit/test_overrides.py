@@ -9,7 +9,7 @@ import pytest
 from monopart.geometry.errors import InputError
 from monopart.toolkit.config import Config
 from monopart.toolkit.overrides import overridden, parse_value, type_text
-from monopart.toolkit.presets import preset, preset_names
+from monopart.toolkit.presets import preset, preset_doubts, preset_names
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -43,6 +43,18 @@ def test_values_change_and_later_ones_win():
     assert config.deform.residual is False and type(config.loss.lpips) is float
     assert overridden(config, ["train.seconds=none"]).train.seconds is None
     assert overridden(config, ["geometry.parts=single"]).geometry.parts == "single"
+
+
+def test_light_is_not_learned_with_poses_unless_it_is_asked_for():
+    for settings, light in (
+        (["refine.poses=True"], False),
+        (["refine.poses=true", "refine.poses=false"], True),
+        (["appearance.light=true", "refine.poses=true"], True),
+    ):
+        config = overridden(Config(), settings)
+        assert config.appearance.light is light
+        both = config.refine.poses and light
+        assert [d.startswith("poses are learned") for d in preset_doubts(config)] == [True] * both
 
 
 def test_types():
