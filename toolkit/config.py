@@ -117,7 +117,7 @@ class AppearanceConfig:
     person turns."""
     light_out: float = 0.1
     """Share of training frames whose light a step leaves out: what surfaces look like, in the mean,
-    that look away from all training cameras."""
+    whose light nobody saw."""
     leave_out: float = 0.5
     """Share of training poses that are blended from their neighbours, like an unseen pose."""
     blend_time: bool = False

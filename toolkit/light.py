@@ -12,14 +12,18 @@ from monopart.geometry.cameras import Camera
 from monopart.geometry.posed_parts import PartPairs, PosedParts
 
 GRAZING = 0.2
-"""Cosine at which a camera sees a surface well; at its negative it does not see it."""
+"""Cosine down to which a camera sees well how light falls on a surface."""
+BEHIND, FADE = -0.95, 0.5
+"""Cosine from which on nothing is known of the light on a surface, and width of the way there."""
 
 
 class Light(torch.nn.Module):
     """Harmonics of the normal below a sample, in the frame of the first training camera.
 
-    A surface that looks away from all training cameras gets zeros, as does a body whose light is
-    switched off: nobody saw how light falls on it, and its colour is the mean over what was seen.
+    A surface that looks away from all training cameras is lit like one that is bent back towards
+    the nearest until that sees it: what falls from above and from the sides falls there too. One
+    that looks straight away gets zeros, as does a body whose light is switched off: nobody saw how
+    light falls on it, and its colour is the mean over what was seen.
     """
 
     eyes: Tensor
@@ -67,9 +71,12 @@ class Light(torch.nn.Module):
             return self._known[1]
         normals = bodies.world_normals()
         towards = functional.normalize(self.eyes - bodies.translation[:, None], dim=-1)
-        facing = (normals @ towards.mT).amax(-1)
-        seen = ((facing + GRAZING) / (2 * GRAZING)).clamp(0.0, 1.0)
-        share = seen * seen * (3 - 2 * seen)
-        table = irradiance_basis(normals @ self.axes.mT) * share[..., None]
+        facing, nearest = (normals @ towards.mT).max(-1)
+        eye = towards.gather(1, nearest[..., None].expand(-1, -1, 3))
+        lacking = (GRAZING - facing).clamp(min=0.0)
+        bent = functional.normalize(normals + lacking[..., None] * eye, dim=-1)
+        known = ((facing - BEHIND) / FADE).clamp(0.0, 1.0)
+        share = known * known * (3 - 2 * known)
+        table = irradiance_basis(bent @ self.axes.mT) * share[..., None]
         self._known = weakref.ref(bodies), table
         return table

@@ -130,7 +130,7 @@ def test_a_light_stands_still_where_the_colour_sees_it(capture: Path, lit: bool)
     assert same != lit
 
 
-def test_light_is_unknown_where_no_camera_looked(capture: Path) -> None:
+def test_light_is_that_of_the_nearest_way_a_surface_was_seen_to_look(capture: Path) -> None:
     avatar = make(capture, config(light=True, pose_feature=False))
     light, record = avatar.model.light, avatar.record
     assert light is not None
@@ -140,14 +140,21 @@ def test_light_is_unknown_where_no_camera_looked(capture: Path) -> None:
     still, bary = torch.zeros_like(face), torch.full((len(face), 2), 1 / 3)
     pairs = PartPairs(face, still, face, bary, (len(face),))
     found = light(bodies, None, still, pairs, torch.arange(len(face)))
-    normals = bodies.world_normals()[0]
-    towards = torch.nn.functional.normalize(camera.center - bodies.translation[0], dim=0)
-    facing = (normals @ towards)[bodies.faces[face]]
-    away, seen = (facing < -0.2).all(1), (facing > 0.2).all(1)
-    assert bool(away.any()) and bool(seen.any())
+    normals = bodies.world_normals()[0].double()
+    towards = torch.nn.functional.normalize(camera.center - bodies.translation[0], dim=0).double()
+    facing = normals @ towards
+    rim = torch.nn.functional.normalize(normals - facing[:, None] * towards, dim=1)
+    # bent by a right triangle: what points along the rim stays, along the eye there is 0.2
+    angle = torch.atan2(torch.full_like(facing, 0.2), facing.square().neg().add(1).sqrt())
+    bent = angle.cos()[:, None] * rim + angle.sin()[:, None] * towards
+    usual = torch.where(facing[:, None] > 0.2, normals, bent).float()
+    expected = irradiance_basis(usual @ camera.R.mT)[bodies.faces[face]].mean(1)
+    facing = facing[bodies.faces[face]]
+    known, away = (facing > -0.45).all(1), (facing < -0.95).all(1)
+    bends = known & (facing < 0).all(1)
+    assert all(bool(some.any()) for some in (bends, away, known & ~bends))
+    torch.testing.assert_close(found[known], expected[known], atol=1e-5, rtol=1e-5)
     assert float(found[away].abs().max()) == 0.0
-    expected = irradiance_basis(normals @ camera.R.mT)[bodies.faces[face]].mean(1)
-    torch.testing.assert_close(found[seen], expected[seen])
     code = torch.ones(len(face), 3)
     dark = light(bodies, torch.zeros(1), still, pairs, torch.arange(len(face)), code)
     assert torch.equal(dark, torch.cat([code, torch.zeros(len(face), 8)], 1))
