@@ -13,14 +13,17 @@ from monopart.geometry.posed_parts import PartPairs, PosedParts
 
 GRAZING = 0.2
 """Cosine down to which a camera sees well how light falls on a surface."""
+BEHIND, FADE = -0.95, 0.5
+"""Cosine from which on nothing is known of the light on a surface, and width of the way there."""
 
 
 class Light(torch.nn.Module):
     """Harmonics of the normal below a sample, in the frame of the first training camera.
 
     A surface that looks away from all training cameras is lit like one that is bent back towards
-    the nearest until that sees it: what falls from above and from the sides falls there too. A
-    body whose light is switched off gets zeros.
+    the nearest until that sees it: what falls from above and from the sides falls there too. One
+    that looks straight away gets zeros, as does a body whose light is switched off: nobody saw how
+    light falls on it, and its colour is the mean over what was seen.
     """
 
     eyes: Tensor
@@ -72,6 +75,8 @@ class Light(torch.nn.Module):
         eye = towards.gather(1, nearest[..., None].expand(-1, -1, 3))
         lacking = (GRAZING - facing).clamp(min=0.0)
         bent = functional.normalize(normals + lacking[..., None] * eye, dim=-1)
-        table = irradiance_basis(bent @ self.axes.mT)
+        known = ((facing - BEHIND) / FADE).clamp(0.0, 1.0)
+        share = known * known * (3 - 2 * known)
+        table = irradiance_basis(bent @ self.axes.mT) * share[..., None]
         self._known = weakref.ref(bodies), table
         return table
