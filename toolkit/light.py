@@ -72,7 +72,7 @@ class Light(torch.nn.Module):
         normals = bodies.world_normals()
         towards = functional.normalize(self.eyes - bodies.translation[:, None], dim=-1)
         facing, nearest = (normals @ towards.mT).max(-1)
-        eye = towards.gather(1, nearest[..., None].expand(-1, -1, 3))
+        eye = towards.take_along_dim(nearest[..., None], dim=1)
         lacking = (GRAZING - facing).clamp(min=0.0)
         bent = functional.normalize(normals + lacking[..., None] * eye, dim=-1)
         known = ((facing - BEHIND) / FADE).clamp(0.0, 1.0)

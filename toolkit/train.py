@@ -33,7 +33,7 @@ from .resume import forget_state, save_state
 from .round_trips import MOMENTS, figures, moment
 from .schedule import Looks, head_box
 from .skipping import EVERY
-from .step_inputs import StepInputs
+from .step_inputs import step_inputs
 from .train_result import TrainResult
 
 PRUNE = 2e-3  # absorption of a step below which a canonical cell counts as empty in training
@@ -79,7 +79,6 @@ class Trainer:
         asked = self.config.loss.consistency or self.config.loss.unseen
         self.objective = Objective(self.config, avatar.canonical_parts() if asked else None)
         self.generator = torch.Generator().manual_seed(self.config.seed)
-        self.inputs = StepInputs(avatar)
         doubts = picture_doubts(avatar.record, seen, self.config.train.patch)
         if self.config.appearance.light:
             doubts += heading_doubts(avatar.record)
@@ -231,7 +230,7 @@ class Trainer:
 
     def _pose(self, batch: PixelBatch, done: float) -> None:
         """Choose the bodies of a step: all as they are given, or those of the batch, corrected."""
-        inputs = self.inputs(self.generator)
+        inputs = step_inputs(self.avatar, self.generator)
         self.posing = dataclasses.replace(self.everyone, inputs=inputs)
         first = 0.0 if self.refined is None else self.config.refine.rigid
         self.avatar.model.rigid = done < max(first, self.config.deform.start)

@@ -24,6 +24,7 @@ from monopart.toolkit.config import Config
 from monopart.toolkit.presets import preset, with_overrides
 from monopart.toolkit.render import render_view
 from monopart.toolkit.resume import load_state, save_state
+from monopart.toolkit.step_inputs import step_inputs
 from monopart.toolkit.train import Trainer
 
 ON = {"pose_feature": True, "knots": 16, "channels": 4, "codes": 12}
@@ -163,10 +164,10 @@ def test_light_is_that_of_the_nearest_way_a_surface_was_seen_to_look(capture: Pa
 def test_a_step_leaves_out_the_light_of_some_frames(capture: Path) -> None:
     for share, least, most in ((0.0, 1.0, 1.0), (0.25, 0.65, 0.85), (1.0, 0.0, 0.0)):
         trainer = Trainer(make(capture, config(light_out=share)))
-        drawn = [trainer.inputs(trainer.generator).lit for _ in range(100)]
+        drawn = [step_inputs(trainer.avatar, trainer.generator).lit for _ in range(100)]
         mean = sum(1.0 if lit is None else float(lit.mean()) for lit in drawn) / 100
         assert least <= mean <= most
-    assert Trainer(make(capture, config(light=False))).inputs(torch.Generator()).lit is None
+    assert step_inputs(make(capture, config(light=False)), torch.Generator()).lit is None
 
 
 @pytest.mark.parametrize(("degrees", "said"), [(40.0, True), (80.0, False), (350.0, True)])
@@ -228,7 +229,7 @@ def test_training_leaves_the_own_frame_out_at_the_rate_that_is_asked_for(capture
         count = len(trainer.scene.frames)
         hits = 0
         for _ in range(100):
-            rows = trainer.inputs(trainer.generator).rows
+            rows = step_inputs(trainer.avatar, trainer.generator).rows
             assert rows is not None
             hits += int((rows[..., 0] == torch.arange(count)[:, None]).all(1).sum())
         own[share] = hits / (100 * count)

@@ -14,6 +14,7 @@ from monopart.toolkit.optimizer import make_optimizer
 from monopart.toolkit.overrides import overridden
 from monopart.toolkit.presets import preset, preset_doubts, preset_names, with_overrides
 from monopart.toolkit.render import render_view
+from monopart.toolkit.step_inputs import step_inputs
 from monopart.toolkit.train import Trainer
 
 
@@ -181,13 +182,15 @@ def test_residuals_begin_when_they_are_told_to(small_capture: Path) -> None:
 def test_times_get_noise_in_training_only(small_capture: Path) -> None:
     trainer = make(small_capture, small(preset("fast"), "deform.time_jitter=2"))
     exact = trainer.avatar.training_input().time
-    found = torch.stack([trainer.inputs(trainer.generator).time - exact for _ in range(400)])
+    found = torch.stack(
+        [step_inputs(trainer.avatar, trainer.generator).time - exact for _ in range(400)]
+    )
     assert float(found.std()) == pytest.approx(2 / (len(exact) - 1), rel=0.1)
     record = trainer.avatar.record
     given = trainer.avatar.frame_input(record.split("train").frames[1], record.poses[1])
     assert torch.equal(given.time, exact[1:2])
     still = make(small_capture, small(preset("fast"), "deform.time_jitter=0"))
-    assert torch.equal(still.inputs(still.generator).time, exact)
+    assert torch.equal(step_inputs(still.avatar, still.generator).time, exact)
 
 
 def test_a_short_span_of_time_is_smoother(small_capture: Path) -> None:
