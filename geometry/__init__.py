@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from .part_tables import regions_by_name as regions_by_name
     from .part_tables import table_by_name as table_by_name
     from .parts import PartMap as PartMap
+    from .pose_motion import joint_motion as joint_motion
     from .posed_parts import PartPairs as PartPairs
     from .posed_parts import PosedParts as PosedParts
     from .posed_parts import RestPoints as RestPoints
@@ -163,6 +164,7 @@ _ROOM = {
     "inverse_skin": "unskin",
     "inverse_skin_all": "unskin_roots",
     "invert_affine": "rigid",
+    "joint_motion": "pose_motion",
     "orbit_cameras": "camera_paths",
     "part_bands": "geodesics",
     "preset_table": "part_tables",

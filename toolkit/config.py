@@ -171,8 +171,20 @@ class RefineConfig:
     """Training frames that the random pixels of a step come from."""
     start: float = 0.02
     """Part of the run after which corrections begin."""
-    rigid: float = 0.4
+    rigid: float = 0.6
     """Part of the run without residuals, which would otherwise explain wrong poses."""
+    align: int = 5
+    """Gauss-Newton steps that align all poses with their pictures; from the first one on poses
+    change by these alone. 0: poses are learned by the steps of the training to its end."""
+    align_start: float = 0.16
+    """Part of the run before the first of these steps; the others follow evenly."""
+    align_end: float = 0.5
+    """Part of the run before the last of them."""
+    align_size: int = 256
+    """Largest side of the pictures in these steps, pixels."""
+    evidence: float = 24.0
+    """Independent differences of colour that a picture counts as in these steps, against the prior:
+    what the avatar gets wrong is wrong in many pixels alike."""
     drift: float = 0.5
     """Slowness of the errors of the tracker: standard deviation of the Gaussian that smooths them
     in time, seconds (25 frames each where the capture has no rate); 0: frames are independent."""
@@ -189,8 +201,9 @@ class RefineConfig:
     """Weight of the squared difference of opacity and mask."""
     margin: float = 0.02
     """Movement of a body after which its shell is built anew, metres; never changes the image."""
-    refit_steps: int = 200
-    """Steps by which the poses of frames that were not trained on are fitted at test."""
+    refit_steps: int = 3
+    """Gauss-Newton steps by which the poses of frames that were not trained on are fitted at
+    test."""
 
 
 @dataclass(frozen=True)

@@ -130,18 +130,6 @@ def _groups(
     return [{"params": p, "base_lr": rate * f} for f, p in found.items() if p]
 
 
-def pose_optimizer(corrections: torch.nn.Module, spec: RefineConfig) -> torch.optim.Adam:
-    """Adam of pose corrections alone, for an avatar that is held.
-
-    Args:
-        corrections: of the frames that are fitted.
-        spec: the rate.
-    """
-    named = {f"corrections.{n}": p for n, p in corrections.named_parameters()}
-    rule: Any = {"betas": _RULE.betas, "eps": _RULE.eps}
-    return Adam(_pose_groups(named, spec), lr=1e-3, fused=True, **rule)
-
-
 def _pose_groups(named: dict[str, torch.nn.Parameter], spec: RefineConfig) -> list[dict[str, Any]]:
     """Groups of the pose corrections among named parameters; none where there are none."""
     shares = {named[n]: share for n, share in CORRECTIONS.items() if n in named}

@@ -10,22 +10,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from torch import Tensor
 
 from monopart.geometry.body import BodyPose
-from monopart.geometry.cameras import Rays
 
 from .avatar import Avatar
-from .captures.patches import PixelSampler
 from .captures.records import CaptureRecord
 from .corrections import PoseCorrections, frame_times
-from .device import sent
 from .evaluate import Evaluation, evaluate_split
-from .losses import color_loss
 from .lpips import LPIPS
 from .metrics import Scores, aggregate
-from .model import FrameInput
-from .optimizer import pose_optimizer
+from .pose_alignment import Shots, align_poses
 from .refine import RefinedPoses, with_poses
 
 Column = Literal["refit (learned)", "refit (training camera)", "refit (uses the test image)"]
@@ -97,75 +91,22 @@ def refit_poses(
     Returns:
         Pose by frame.
     """
-    config, record = avatar.config, avatar.record
-    spec, times = config.refine, frame_times(frames, record.fps)
+    record, spec = avatar.record, avatar.config.refine
     fix = PoseCorrections(len(frames), record.body.num_joints).to(avatar.device)
-    fix.couple(times, spec.drift, spec.jitter)
+    fix.couple(frame_times(frames, record.fps), spec.drift, spec.jitter)
     refined = RefinedPoses(avatar, frames, fix)
-    sampler = _sampler(record, camera, frames, config.train.band)
-    inputs = _inputs(avatar, frames)
-    optimizer = pose_optimizer(fix, spec)
-    generator = torch.Generator().manual_seed(config.seed)
-    steps = spec.refit_steps
-    learning = [p for p in avatar.model.parameters() if p.requires_grad]
-    try:
-        for parameter in learning:
-            parameter.requires_grad_(False)
-        for step in range(steps):
-            for group in optimizer.param_groups:
-                group["lr"] = group["base_lr"] * config.train.lr_final ** (step / steps)
-            optimizer.zero_grad()
-            _loss(refined, sampler, camera, inputs, generator).backward()
-            optimizer.step()
-            if progress is not None:
-                progress(step + 1, steps)
-    finally:
-        for parameter in learning:
-            parameter.requires_grad_(True)
-    return refined.corrected()
-
-
-def _sampler(
-    record: CaptureRecord, camera: int, frames: tuple[int, ...], band: int
-) -> PixelSampler:
     images = torch.stack([record.image(camera, f) for f in frames])
-    masks = torch.stack([record.mask(camera, f) for f in frames])
-    return PixelSampler((images * 255.0).round().to(torch.uint8), masks, band)
-
-
-@torch.no_grad()
-def _inputs(avatar: Avatar, frames: tuple[int, ...]) -> FrameInput:
-    """Times and codes of frames, blended as for any pose that was not trained on."""
-    each = [avatar.frame_input(f, avatar.record.poses[f]) for f in frames]
-    codes = [one.code for one in each if one.code is not None]
-    return FrameInput(torch.cat([one.time for one in each]), torch.cat(codes) if codes else None)
-
-
-def _loss(
-    refined: RefinedPoses,
-    sampler: PixelSampler,
-    camera: int,
-    inputs: FrameInput,
-    generator: torch.Generator,
-) -> Tensor:
-    """The objective of one step: colours over a random background, and small, smooth changes."""
-    avatar, spec = refined.avatar, refined.avatar.config.refine
-    device = avatar.device
-    batch = sampler.random(avatar.config.train.rays, generator, spec.frames)
-    jitter = torch.rand(len(batch.image), generator=generator)
-    ground = torch.rand(3, generator=generator)
-    posing = refined.posing(sent(batch.image.unique(), device), inputs)
-    body = posing.place[sent(batch.image, device)]
-    seen = avatar.record.cameras[camera].rays(sent(batch.pixels, device))
-    world = Rays(seen.origins.expand_as(seen.directions), seen.directions)
-    rays = posing.scene.local_rays(world, body)
-    out = avatar.model.render_rays(
-        posing.scene.parts, posing.inputs, rays, body, sent(jitter, device)
+    shots = Shots(
+        (images * 255.0).round().to(torch.uint8),
+        torch.stack([record.mask(camera, f) for f in frames]),
+        [record.cameras[camera]] * len(frames),
+        range(len(frames)),
     )
-    target = sent(batch.color + (~batch.mask)[:, None] * ground, device)
-    color = out.color + (1.0 - out.opacity)[:, None] * sent(ground, device)
-    terms = refined.terms(out.opacity, sent(batch.mask, device), spec)
-    return avatar.config.loss.mse * color_loss(color, target) + sum(terms.values())
+    for step in range(spec.refit_steps):
+        align_poses(refined, shots)
+        if progress is not None:
+            progress(step + 1, spec.refit_steps)
+    return refined.corrected()
 
 
 def refit_scores(

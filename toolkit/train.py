@@ -14,6 +14,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from monopart.geometry.cameras import Rays
 from monopart.geometry.stages import stage
 
+from .alignment_schedule import align_when_due
 from .avatar import Avatar
 from .captures.cache import Pictures, read_pictures
 from .captures.doubts import heading_doubts, picture_doubts
@@ -310,6 +311,7 @@ class Trainer:
             if done >= 1.0:
                 break
             with repeatable(config.deterministic):
+                align_when_due(self, done)
                 numbers = self.step(step, done)
             step += 1
             result.iterations = step

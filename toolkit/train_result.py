@@ -17,6 +17,8 @@ class TrainResult:
         warnings: what a reader of the report must know.
         round_trips: histograms of the round-trip distances at some moments.
         capacity: size of each part's field.
+        alignments: what the steps did that aligned the poses, see `align_poses`,
+            and the finished part of the run before each.
         skipped: steps that were left out because a loss or a gradient was not finite.
         bad_steps: facts of the first of them.
     """
@@ -28,5 +30,6 @@ class TrainResult:
     warnings: list[str] = field(default_factory=list)
     round_trips: list[dict[str, Any]] = field(default_factory=list)
     capacity: list[dict[str, Any]] = field(default_factory=list)
+    alignments: list[dict[str, float]] = field(default_factory=list)
     skipped: int = 0
     bad_steps: list[dict[str, Any]] = field(default_factory=list)

@@ -33,6 +33,7 @@ COVERED: dict[str, str] = {
     "blend_skin": "blend_skin",
     "blend_transforms": "unskin",
     "skin": "blend_skin",
+    "joint_motion": "joint_motion",
     "unskin": "unskin",
     "BodyModel.__call__": "body",
     "BodyModel.shaped": "body",

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from monopart.geometry.kinematics import KinematicTree, forward_kinematics
+from monopart.geometry.pose_motion import joint_motion
 from monopart.geometry.rotations import axis_angle_to_rotmat
 from monopart.geometry.skinning import SkinWeights, blend_skin, blend_transforms, skin, unskin
 
@@ -269,6 +270,43 @@ def _skinning() -> Stress:
     )
 
 
+def _exact_motion(extra: _Weighted, rest: np.ndarray, transforms: np.ndarray) -> np.ndarray:
+    """Turns of the joints of a chain, one joint, axis and carried joint after the other."""
+    weights, count = extra.double.dense.numpy()[: len(rest)], len(transforms)
+    out = np.zeros((len(rest), count, 3, 3))
+    images = [rest @ t[:3, :3].T + t[:3, 3] for t in transforms]
+    for j in range(count):
+        turned = transforms[j - 1, :3, :3] if j else np.eye(3)
+        lever = sum(
+            weights[:, k, None] * (images[k] - transforms[j, :3, 3]) for k in range(j, count)
+        )
+        for axis in range(3):
+            out[:, j, axis] = np.cross(turned[:, axis], lever)
+    return out
+
+
+def _motion() -> Stress:
+    count = 128
+
+    def run(extra: _Weighted, rest: Tensor, transforms: Tensor) -> Tensor:
+        chain = KinematicTree(tuple(range(-1, len(transforms) - 1)))
+        joints = transforms[:, :3, 3]
+        return joint_motion(rest, extra.like(rest).dense, transforms, joints, chain)
+
+    return Stress(
+        name="joint_motion",
+        title="motion of skinned points by turns of joints",
+        domain="weights that sum to 1, any pose; other sums scale the result, finite",
+        error="largest coordinate of points and translations",
+        families=_skinning_families(count),
+        ways=(Way("monopart", run, True),),
+        exact=_exact_motion,
+        scale=_skin_scale,
+        wrt=(0, 1),
+        cases=count,
+    )
+
+
 def _unskin() -> Stress:
     count = 512
 
@@ -309,4 +347,4 @@ def stresses() -> list[Stress]:
     """Operations on skeletons and bodies."""
     from . import stability_bodies
 
-    return [_kinematics(), _skinning(), _unskin(), *stability_bodies.stresses()]
+    return [_kinematics(), _skinning(), _motion(), _unskin(), *stability_bodies.stresses()]
