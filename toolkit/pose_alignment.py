@@ -119,8 +119,8 @@ def align_poses(
     mix = torch.eye(frames).to(square) if fix.mix is None else fix.mix.double()
     step = _solve(square, mix, mix @ pull - now) * free
     turned, shifted = step.split([size - 3, 3], 1)
-    fix.rotations += turned.view_as(fix.rotations).to(fix.rotations)
-    fix.translations += shifted.to(fix.translations)
+    fix.rotations.add_(turned.view_as(fix.rotations).to(fix.rotations))
+    fix.translations.add_(shifted.to(fix.translations))
     added = (mix @ turned).unflatten(1, (-1, 3)).norm(dim=-1).mean()
     return {"rms": mean**0.5, "radians": float(added)}
 
