@@ -7,6 +7,8 @@ import torch
 from .config import RefineConfig
 from .corrections import PoseCorrections
 from .pose_alignment import Shots, align_poses
+from .refine import RefinedPoses
+from .scene import SceneBodies
 
 if TYPE_CHECKING:
     from .train import Trainer
@@ -37,11 +39,23 @@ def align_when_due(trainer: "Trainer", done: float) -> None:
         return
     fix = trainer.refined.corrections
     last = passed(spec, said[-1]["done"]) if said else 0
-    if passed(spec, done) > last:
+    due = passed(spec, done) > last
+    if due:
         said.append({"done": done, **_align(trainer, fix)})
-    if said:
-        fix.rotations.requires_grad_(False)
-        fix.translations.requires_grad_(False)
+    if said and (due or fix.rotations.requires_grad):
+        _hold(trainer, trainer.refined)
+
+
+def _hold(trainer: "Trainer", refined: RefinedPoses) -> None:
+    """From now on the bodies stand still, so that a step may look at all of them."""
+    fix, avatar = refined.corrections, trainer.avatar
+    fix.requires_grad_(False)
+    rows = torch.arange(len(refined.frames), device=refined.given.pose.device)
+    with torch.no_grad():
+        poses = refined.poses(rows)
+    trainer.stand(
+        SceneBodies.of_poses(avatar.record, poses, refined.frames, avatar.config, avatar.canonical)
+    )
 
 
 def _align(trainer: "Trainer", fix: PoseCorrections) -> dict[str, float]:

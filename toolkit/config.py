@@ -175,7 +175,7 @@ class RefineConfig:
     """Part of the run without residuals, which would otherwise explain wrong poses."""
     align: int = 5
     """Gauss-Newton steps that align all poses with their pictures; from the first one on poses
-    change by these alone. 0: poses are learned by the steps of the training to its end."""
+    change by these alone, and a shape no more. 0: steps of the training learn them to its end."""
     align_start: float = 0.16
     """Part of the run before the first of these steps; the others follow evenly."""
     align_end: float = 0.5

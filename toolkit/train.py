@@ -32,6 +32,7 @@ from .refine import Posing, RefinedPoses, with_corrections
 from .replay import note_skipped
 from .resume import forget_state, save_state
 from .round_trips import MOMENTS, figures, moment
+from .scene import SceneBodies
 from .schedule import Looks, head_box
 from .skipping import EVERY
 from .step_inputs import step_inputs
@@ -65,8 +66,7 @@ class Trainer:
         self.config = avatar.config
         train = avatar.record.split("train")
         seen = pictures or read_pictures(avatar.record, "train", avatar.cache, progress)
-        self.scene = avatar.scene(train.frames)
-        self.everyone = self.posing = Posing.of_all(self.scene, avatar.training_input())
+        self.stand(avatar.scene(train.frames))
         self.refined = None
         if avatar.model.corrections is not None:
             self.refined = RefinedPoses(avatar, train.frames, avatar.model.corrections)
@@ -89,6 +89,15 @@ class Trainer:
         self.average = [p.detach().clone() for p in avatar.model.parameters()]
         self.skip = EVERY  # what a step leaves out; a comparison switches kinds off
         self.last: dict[str, float] = {}
+
+    def stand(self, scene: SceneBodies) -> None:
+        """Take the bodies of all training frames, which then stand still.
+
+        Args:
+            scene: the bodies, in the order of the frames.
+        """
+        self.scene = scene
+        self.everyone = self.posing = Posing.of_all(scene, self.avatar.training_input())
 
     @property
     def sampler(self) -> PixelSampler:
@@ -226,8 +235,10 @@ class Trainer:
         return float(torch.rand((), generator=self.generator))
 
     def _refines(self, done: float) -> bool:
-        """Whether poses are learned at a finished part of the run."""
-        return self.refined is not None and done >= self.config.refine.start
+        """Whether poses are learned by the steps at a finished part of the run."""
+        if self.refined is None or self.result.alignments:
+            return False
+        return done >= self.config.refine.start
 
     def _pose(self, batch: PixelBatch, done: float) -> None:
         """Choose the bodies of a step: all as they are given, or those of the batch, corrected."""

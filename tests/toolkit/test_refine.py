@@ -40,6 +40,7 @@ SMALL = with_overrides(
         "start": 0.0,
         "rigid": 0.5,
         "refit_steps": 3,
+        "align": 0,
         "smooth": 1e-5,
     },
 )
@@ -200,12 +201,13 @@ class _Died(Exception):
     pass
 
 
+@pytest.mark.parametrize("align", [0, 2])
 def test_a_resumed_refinement_equals_an_unbroken_one(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, align: int
 ) -> None:
-    whole = trainer(capture, tmp_path / "whole")
+    whole = trainer(capture, tmp_path / "whole", align=align)
     whole.loop()
-    broken = trainer(capture, tmp_path / "broken")
+    broken = trainer(capture, tmp_path / "broken", align=align)
     step = broken.step
 
     def dying(number: int, done: float) -> dict[str, float]:
@@ -218,14 +220,15 @@ def test_a_resumed_refinement_equals_an_unbroken_one(
     monkeypatch.setattr(broken, "step", dying)
     with pytest.raises(_Died):
         broken.loop()
-    again = trainer(capture, tmp_path / "broken")
+    again = trainer(capture, tmp_path / "broken", align=align)
     load_state(again, tmp_path / "broken")
     again.loop()
     expected, found = whole.avatar.model.state_dict(), again.avatar.model.state_dict()
     assert all(torch.equal(expected[k], found[k]) for k in expected)
     assert bool(found["corrections.rotations"].any())
     lines = (tmp_path / "whole" / "train.jsonl").read_text().splitlines()
-    assert {"pose_size", "pose_roughness"} <= set(json.loads(lines[-1])["losses"])
+    assert {"pose_size", "pose_roughness"} <= set(json.loads(lines[0])["losses"])
+    assert len(whole.result.alignments) == len(again.result.alignments) == align
 
 
 def test_two_threads_repeat_a_refinement(capture: Path) -> None:
