@@ -4,6 +4,7 @@ import dataclasses
 from itertools import pairwise
 from pathlib import Path
 
+import noisy_track
 import pytest
 import torch
 from miniature import write_miniature
@@ -210,3 +211,15 @@ def test_alignment_leaves_the_weights_alone(tmp_path: Path) -> None:
     assert changed <= {"corrections.rotations", "corrections.translations"} and changed
     align_when_due(trained, 0.5)
     assert len(trained.result.alignments) == 1
+
+
+def test_the_track_that_errs_errs_as_it_says(tmp_path: Path) -> None:
+    root = write_miniature(tmp_path / "four", size=32)
+    noisy_track.main(root, tmp_path / "noisy", seed=1)
+    exact, noisy = read_capture(root), read_capture(tmp_path / "noisy", params=noisy_track.NOISY)
+    frames = exact.split("train").frames
+    off = torch.stack([noisy.poses[f].pose - exact.poses[f].pose for f in frames])
+    assert not off[:, 0].any() and 0.01 < float(off[:, 1:].std()) < 0.04
+    shift = torch.stack([noisy.poses[f].translation - exact.poses[f].translation for f in frames])
+    assert 0.001 < float(shift.std()) < 0.02
+    assert torch.equal(noisy.poses[0].betas, exact.poses[0].betas)
