@@ -201,6 +201,14 @@ GEOMETRY = (
         "over = ~(distance < threshold)",
         _geometry("consistency"),
     ),
+    Mutant(
+        "axes in which a joint turns",
+        "wrong frame",
+        "geometry/pose_motion.py",
+        "transforms[parents, :3, :3].mT.clone()",
+        "transforms[parents, :3, :3].clone()",
+        _geometry("pose_motion"),
+    ),
 )
 
 FIELDS = (
@@ -361,6 +369,14 @@ TOOLKIT = (
         "(first - near) * (first + near) / (2 * width**2)",
         "(first - near) / (2 * width**2)",
         _toolkit("memory"),
+    ),
+    Mutant(
+        "a surface takes its picture along",
+        "wrong sign",
+        "toolkit/pose_alignment.py",
+        "change = -torch.einsum(",
+        "change = torch.einsum(",
+        _toolkit("pose_alignment"),
     ),
 )
 
