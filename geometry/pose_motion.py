@@ -9,10 +9,13 @@ from .kinematics import KinematicTree
 
 
 def descendants(tree: KinematicTree) -> Float[Tensor, "j j"]:
-    """Which joints a joint carries: entry [k, j] is 1 where k is j or comes after it.
+    """Which joints a joint carries.
 
     Args:
         tree: the joints.
+
+    Returns:
+        Entry [k, j] is 1 where k is j or comes after it, else 0.
 
     >>> descendants(KinematicTree((-1, 0, 0)))
     tensor([[1., 0., 0.],

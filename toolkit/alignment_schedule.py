@@ -41,7 +41,7 @@ def align_when_due(trainer: "Trainer", done: float) -> None:
     last = passed(spec, said[-1]["done"]) if said else 0
     due = passed(spec, done) > last
     if due:
-        said.append({"done": done, **_align(trainer, fix)})
+        said.append({"done": done, **_align(trainer, trainer.refined)})
     if said and (due or fix.rotations.requires_grad):
         _hold(trainer, trainer.refined)
 
@@ -58,10 +58,9 @@ def _hold(trainer: "Trainer", refined: RefinedPoses) -> None:
     )
 
 
-def _align(trainer: "Trainer", fix: PoseCorrections) -> dict[str, float]:
+def _align(trainer: "Trainer", refined: RefinedPoses) -> dict[str, float]:
     """One alignment with the averaged weights, which the steps do not shake."""
-    assert trainer.refined is not None
-    looks = trainer.looks
+    fix, looks = refined.corrections, trainer.looks
     shots = Shots(
         looks.pictures.images,
         looks.pictures.masks,
@@ -75,7 +74,7 @@ def _align(trainer: "Trainer", fix: PoseCorrections) -> dict[str, float]:
         for value, average in zip(parameters, trainer.average, strict=True):
             if averaged and not _poses(value, fix):
                 value.copy_(average)
-        facts = align_poses(trainer.refined, shots)
+        facts = align_poses(refined, shots)
         for value, average, before in zip(parameters, trainer.average, now, strict=True):
             if _poses(value, fix):
                 average.copy_(value)
