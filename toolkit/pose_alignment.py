@@ -26,8 +26,8 @@ from .avatar import View
 from .corrections import ANGLE, LENGTH
 from .refine import RefinedPoses
 from .render import render_view
+from .skipping import PRUNE
 
-PRUNE = 2e-3  # absorption of a step below which a canonical cell counts as empty
 BLUR = 0.8  # standard deviation of the blur of both pictures, pixels of the aligned size
 EDGE = 2  # pixels around the person in either picture that take part
 SEEN = 0.05  # opacity from which on a pixel is of the person
@@ -81,10 +81,7 @@ def aligned_size(size: tuple[int, int], largest: int) -> tuple[int, int]:
 
 
 @torch.no_grad()
-def align_poses(
-    refined: RefinedPoses,
-    shots: Shots,
-) -> dict[str, float]:
+def align_poses(refined: RefinedPoses, shots: Shots) -> dict[str, float]:
     """One step for the corrections of all frames; the avatar is held.
 
     Minimises, with pictures linear in the corrections, Σ_f e ‖r_f‖² / (n_f s²) + ‖z‖²: r are the

@@ -17,8 +17,8 @@ from .losses import round_trip_distance
 from .model import AvatarModel, FrameInput, Rendered, Shaded
 from .profiling import twin_of
 from .render import render_view
-from .skipping import EVERY, KINDS, Skipping
-from .train import PRUNE, Trainer
+from .skipping import EVERY, KINDS, PRUNE, Skipping
+from .train import Trainer
 from .unskipped import partly_skipping
 
 ROUNDS = 2  # times that each is measured, in turn; the shorter time counts

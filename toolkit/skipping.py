@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from monopart.geometry.errors import InputError
 
+PRUNE = 2e-3  # absorption of a step below which a canonical cell counts as empty in training
+
 
 @dataclass(frozen=True)
 class Skipping:

@@ -34,11 +34,10 @@ from .resume import forget_state, save_state
 from .round_trips import MOMENTS, figures, moment
 from .scene import SceneBodies
 from .schedule import Looks, head_box
-from .skipping import EVERY
+from .skipping import EVERY, PRUNE
 from .step_inputs import step_inputs
 from .train_result import TrainResult
 
-PRUNE = 2e-3  # absorption of a step below which a canonical cell counts as empty in training
 PROBE_EVERY = 16  # steps between two renderings without learned skipping, which refresh it
 
 Progress = Callable[[float, dict[str, float]], None]
