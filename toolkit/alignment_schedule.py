@@ -8,7 +8,7 @@ from .config import RefineConfig
 from .corrections import PoseCorrections
 from .pose_alignment import Shots, align_poses
 from .refine import RefinedPoses
-from .scene import SceneBodies
+from .scene import SceneBodies, stack_poses
 
 if TYPE_CHECKING:
     from .train import Trainer
@@ -48,11 +48,9 @@ def align_when_due(trainer: "Trainer", done: float) -> None:
 
 def _hold(trainer: "Trainer", refined: RefinedPoses) -> None:
     """From now on the bodies stand still, so that a step may look at all of them."""
-    fix, avatar = refined.corrections, trainer.avatar
-    fix.requires_grad_(False)
-    rows = torch.arange(len(refined.frames), device=refined.given.pose.device)
-    with torch.no_grad():
-        poses = refined.poses(rows)
+    avatar = trainer.avatar
+    refined.corrections.requires_grad_(False)
+    poses = stack_poses(list(refined.corrected().values()))
     trainer.stand(
         SceneBodies.of_poses(avatar.record, poses, refined.frames, avatar.config, avatar.canonical)
     )
@@ -67,19 +65,19 @@ def _align(trainer: "Trainer", refined: RefinedPoses) -> dict[str, float]:
         [looks.cameras[i] for i in trainer.camera_of_image.tolist()],
         trainer.body_of_image.tolist(),
     )
-    parameters = list(trainer.avatar.model.parameters())
-    now = [p.detach().clone() for p in parameters]
-    averaged = bool(trainer.config.train.ema and trainer.result.iterations)
+    both = list(zip(trainer.avatar.model.parameters(), trainer.average, strict=True))
+    field = [(value, average) for value, average in both if not _poses(value, fix)]
+    now = [value.detach().clone() for value, _ in field]
     with torch.no_grad():
-        for value, average in zip(parameters, trainer.average, strict=True):
-            if averaged and not _poses(value, fix):
+        if trainer.config.train.ema and trainer.result.iterations:
+            for value, average in field:
                 value.copy_(average)
         facts = align_poses(refined, shots)
-        for value, average, before in zip(parameters, trainer.average, now, strict=True):
+        for (value, _), before in zip(field, now, strict=True):
+            value.copy_(before)
+        for value, average in both:
             if _poses(value, fix):
                 average.copy_(value)
-            else:
-                value.copy_(before)
     return facts
 
 

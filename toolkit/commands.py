@@ -287,7 +287,7 @@ def _training_facts(path: Path) -> tuple[TrainResult, dict[str, float]]:
     if lacking:
         raise InputError(f"{path}: expected {lacking[0]}, found no such entry; restore the file")
     facts["stats"] = Counter(facts["stats"])
-    return TrainResult(**{n: facts[n] for n in names if n in facts}), facts["stages"]
+    return TrainResult(**{n: facts[n] for n in names}), facts["stages"]
 
 
 def render(

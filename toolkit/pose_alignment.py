@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from kornia.filters import gaussian_blur2d, spatial_gradient
 from torch import Tensor
 
-from monopart.geometry.body import BodyModel, BodyPose
+from monopart.geometry.body import BodyModel, BodyPose, PosedBody
 from monopart.geometry.cameras import Camera
 from monopart.geometry.pose_motion import joint_motion
 from monopart.geometry.skinning import blend_transforms, unskin
@@ -162,7 +162,8 @@ def _slope(refined: RefinedPoses, shots: Shots, index: int) -> Slope:
     batch = refined.poses(torch.tensor([row], device=refined.given.pose.device))
     pose = BodyPose(batch.pose[0], batch.betas[0], batch.rotation[0], batch.translation[0])
     view = View(camera=camera, pose=pose, frame=refined.frames[row])
-    picture = render_view(refined.avatar, view, prune=PRUNE)
+    scene = refined.avatar.pose_scene(pose)
+    picture = render_view(refined.avatar, view, prune=PRUNE, scene=scene)
     made = torch.cat([picture.color, picture.opacity[..., None]], -1).permute(2, 0, 1)
     both = torch.stack([made, _taken(shots, index, size).to(made)])
     near = F.max_pool2d(both[:, 3].amax(0)[None], 2 * EDGE + 1, 1, EDGE)[0] > SEEN
@@ -172,7 +173,7 @@ def _slope(refined: RefinedPoses, shots: Shots, index: int) -> Slope:
     window = 2 * round(3 * BLUR) + 1
     both = gaussian_blur2d(both, (window, window), (BLUR, BLUR))
     slope = spatial_gradient(both.mean(0, keepdim=True), "sobel")[0, :, :, ys, xs]  # C 2 P
-    moved = _pixel_motion(body, batch, camera, place, depth[ys, xs])
+    moved = _pixel_motion(body, scene.posed, camera, place, depth[ys, xs])
     change = -torch.einsum("cdp,pdk->pck", slope, moved)
     off = (both[1] - both[0])[:, ys, xs].T
     trust = (HUBER / off.norm(dim=1).clamp(min=HUBER)).sqrt()
@@ -202,18 +203,17 @@ def _filled(depth: Tensor, known: Tensor) -> Tensor:
 
 
 def _pixel_motion(
-    body: BodyModel, pose: BodyPose, camera: Camera, place: Tensor, depth: Tensor
+    body: BodyModel, posed: PosedBody, camera: Camera, place: Tensor, depth: Tensor
 ) -> Float[Tensor, "p 2 d"]:
     """Motion of the pixels of surface points by the corrections of one frame.
 
     Args:
         body: the body model.
-        pose: [1] pose.
+        posed: [1] the body of that frame.
         camera: the camera.
         place: [P, 2] row and column of pixels.
         depth: [P] distance of the surface along their rays, metres.
     """
-    posed = body(pose)
     rays = camera.rays(place.flip(1).to(depth) + 0.5)
     world = rays.origins + depth[:, None] * rays.directions
     turn, shift = posed.rotation[0], posed.translation[0]

@@ -57,9 +57,7 @@ def main(capture: Positional[Path], out: Positional[Path], seed: int = 7) -> Non
             "Rh": turned(ROOT * row[None, 72:75], exact["Rh"]).astype(np.float32),
             "Th": (exact["Th"] + SHIFT * row[75:]).astype(np.float32),
         }
-        box = np.zeros((), dtype=object)
-        box[()] = wrong
-        np.save(out / NOISY / path.name, box, allow_pickle=True)
+        np.save(out / NOISY / path.name, np.array(wrong, dtype=object), allow_pickle=True)
 
 
 if __name__ == "__main__":

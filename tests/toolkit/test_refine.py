@@ -57,9 +57,7 @@ def add_noise(root: Path, frames: int) -> None:
         stored["poses"][:, :3] = 0
         stored["Rh"] = stored["Rh"] + rng.normal(0, 0.05, (1, 3)).astype(np.float32)
         stored["Th"] = stored["Th"] + rng.normal(0, 0.02, (1, 3)).astype(np.float32)
-        box = np.zeros((), dtype=object)
-        box[()] = stored
-        np.save(path, box, allow_pickle=True)
+        np.save(path, np.array(stored, dtype=object), allow_pickle=True)
 
 
 @pytest.fixture(scope="module")
