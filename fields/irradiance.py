@@ -6,6 +6,8 @@ from torch import Tensor
 
 NUM_IRRADIANCE = 8
 """Columns of :func:`irradiance_basis`."""
+ZONAL = 2, 7
+"""Columns that a turn about the z axis leaves alone; the mean of the others over all turns is 0."""
 
 
 def irradiance_basis(normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 8"]:

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from monopart.geometry.cameras import Camera
-from monopart.geometry.errors import BackendError, InputError
+from monopart.geometry.errors import BackendError
 
 from .backend import choose_backend
 
@@ -77,16 +77,9 @@ def project_gaussians(gaussians: Gaussians, camera: Camera) -> Splats:
 
     Reference: Zwicker et al., 2002, eq. (31): J W Σ Wᵀ Jᵀ.
     """
-    if camera.is_distorted:
-        raise InputError(
-            "camera: expected a pinhole, found a lens with distortion; undistort the image and "
-            "take camera.without_lens()"
-        )
+    slopes = camera.pixel_slopes(gaussians.points, NEAREST)
     means, depth = camera.project(gaussians.points)
-    x, y, z = camera.to_camera(gaussians.points).unbind(-1)
-    z, zero = z.clamp_min(NEAREST), torch.zeros_like(z)
-    slopes = torch.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], -1).unflatten(-1, (2, 3))
-    flat = camera.K.to(z)[:2, :2] @ slopes @ (camera.R.to(z) @ gaussians.factors)
+    flat = slopes @ gaussians.factors
     u, v = flat.unbind(1)
     uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
     # Cauchy-Binet: a sum of squares, where uu vv - uv² cancels.

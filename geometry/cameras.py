@@ -213,6 +213,33 @@ class Camera:
         outside = pixels.new_tensor([-self.size[1], -self.size[0]])
         return torch.where(front, pixels, outside), depth
 
+    def pixel_slopes(
+        self, points: Float[Tensor, "*b 3"], nearest: float = MIN_DEPTH
+    ) -> Float[Tensor, "*b 2 3"]:
+        """How pixels of points move with the points, to first order: the Jacobian of `project`.
+
+        Args:
+            points: world metres, *b 3.
+            nearest: depth that nearer points and those behind count with, metres; slopes are finite
+                there and mean nothing.
+
+        Returns:
+            ∂(x, y)/∂(point), pixels per metre, differentiable in the points and the camera.
+
+        Raises:
+            InputError: the camera has a lens.
+        """
+        if self.is_distorted:
+            raise InputError(
+                "camera: expected a pinhole, found a lens with distortion; undistort the image and "
+                "take camera.without_lens()"
+            )
+        x, y, z = self.to_camera(points).unbind(-1)
+        z, zero = z.clamp_min(nearest), torch.zeros_like(z)
+        x, y, one = x / z, y / z, 1 / z
+        plane = torch.stack([one, zero, -x * one, zero, one, -y * one], -1).unflatten(-1, (2, 3))
+        return self.K.to(points)[:2, :2] @ plane @ self.R.to(points)
+
     def visible(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
         """Which points fall into the image: in front, inside the frame and inside the lens's fold.
 

@@ -15,6 +15,7 @@ from .capacity import allocated
 from .captures.records import CaptureRecord
 from .config import Config
 from .corrections import frame_times
+from .light import Light
 from .memory import PoseMemory
 from .model import AvatarModel
 from .prepared import distance_prior
@@ -53,8 +54,8 @@ class Avatar:
         prior = None
         if config.field.prior_slope:
             prior = distance_prior(canonical.verts, record.body.faces, cache)
-        cameras = [record.cameras[c] for c in record.split("train").cameras]
-        model = AvatarModel(config, record.body, canonical, len(frames), prior, cameras)
+        light = Light.of(record) if config.appearance.light else None
+        model = AvatarModel(config, record.body, canonical, len(frames), prior, light)
         model.to(canonical.verts.device)  # initial values are drawn on the CPU: the same anywhere
         if model.corrections is not None:
             times, spec = frame_times(frames, record.fps), config.refine

@@ -1,6 +1,5 @@
 """The avatar: part fields, residuals and appearance over the geometry of posed bodies."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +14,7 @@ from monopart.fields.part_union import union_by_density
 from monopart.fields.residual import UVT_GRID, ResidualField
 from monopart.fields.volume import Composite, composite
 from monopart.geometry.body import BodyModel, PosedBody
-from monopart.geometry.cameras import Camera, Rays
+from monopart.geometry.cameras import Rays
 from monopart.geometry.culling import ShellSamples
 from monopart.geometry.moving_parts import MovingParts
 from monopart.geometry.parts import PartMap, rows_of_parts
@@ -114,7 +113,7 @@ class AvatarModel(torch.nn.Module):
         canonical: PosedBody,
         frames: int,
         prior: DistancePrior | None = None,
-        cameras: Sequence[Camera] = (),
+        light: Light | None = None,
     ) -> None:
         """Build the modules.
 
@@ -124,7 +123,7 @@ class AvatarModel(torch.nn.Module):
             canonical: the body of the person in the canonical pose.
             frames: number of training frames.
             prior: the distance prior of that body where the caller has it; None makes one.
-            cameras: the training cameras; without one the colours see no light.
+            light: how light falls on the person; None: the colours see none.
         """
         super().__init__()
         self.config = config
@@ -132,7 +131,7 @@ class AvatarModel(torch.nn.Module):
         self.num_parts = len(self.parts.names)
         lo, hi = part_boxes(body, canonical, self.parts, config.geometry)
         spec, deform = config.field, config.deform
-        self.light = Light(cameras) if config.appearance.light and cameras else None
+        self.light = light
         sizes = field_spec(spec, self.num_parts, config.appearance, self.light is not None)
         self.field = PartField(lo, hi, sizes)
         self.prior = None

@@ -70,16 +70,6 @@ class Slope:
     values: int
 
 
-def aligned_size(size: tuple[int, int], largest: int) -> tuple[int, int]:
-    """Height and width of a picture that is no larger than a side.
-
-    >>> aligned_size((512, 384), 256)
-    (256, 192)
-    """
-    ratio = min(1.0, largest / max(size))
-    return max(1, round(size[0] * ratio)), max(1, round(size[1] * ratio))
-
-
 @torch.no_grad()
 def align_poses(refined: RefinedPoses, shots: Shots) -> dict[str, float]:
     """One step for the corrections of all frames; the avatar is held.
@@ -157,15 +147,15 @@ def _slope(refined: RefinedPoses, shots: Shots, index: int) -> Slope:
     """The picture of one shot and its derivatives at the present pose of its frame."""
     row, body = shots.rows[index], refined.avatar.record.body
     largest = refined.avatar.config.refine.align_size
-    size = aligned_size(shots.cameras[index].size, largest)
-    camera = shots.cameras[index].resized(size).to(refined.given.pose)
+    camera = shots.cameras[index].to(refined.given.pose)
+    camera = camera.resized(min(1.0, largest / max(camera.size)))
     batch = refined.poses(torch.tensor([row], device=refined.given.pose.device))
     pose = BodyPose(batch.pose[0], batch.betas[0], batch.rotation[0], batch.translation[0])
     view = View(camera=camera, pose=pose, frame=refined.frames[row])
     scene = refined.avatar.pose_scene(pose)
     picture = render_view(refined.avatar, view, prune=PRUNE, scene=scene)
     made = torch.cat([picture.color, picture.opacity[..., None]], -1).permute(2, 0, 1)
-    both = torch.stack([made, _taken(shots, index, size).to(made)])
+    both = torch.stack([made, _taken(shots, index, camera.size).to(made)])
     near = F.max_pool2d(both[:, 3].amax(0)[None], 2 * EDGE + 1, 1, EDGE)[0] > SEEN
     depth = _filled(picture.depth / picture.opacity.clamp(min=SEEN), picture.opacity > SOLID)
     place = (near & (depth > 0.0)).nonzero()
@@ -227,11 +217,4 @@ def _pixel_motion(
     eye = torch.eye(3).to(world).expand(len(world), 3, 3)
     root = torch.linalg.cross(eye, (world - shift)[:, None].expand(-1, 3, 3))
     steps = torch.cat([(joint @ turn.mT).flatten(1, 2), root, eye], 1)  # P D 3
-    seen = camera.to_camera(world)
-    x, y, z = seen.unbind(-1)
-    fx, skew, fy = camera.K[0, 0], camera.K[0, 1], camera.K[1, 1]
-    none = torch.zeros_like(z)
-    across = torch.stack([fx / z, skew / z, -(fx * x + skew * y) / z.square()], -1)
-    down = torch.stack([none, fy / z, -fy * y / z.square()], -1)
-    project = torch.stack([across, down], 1) @ camera.R.to(world)  # P 2 3
-    return project @ steps.mT
+    return camera.pixel_slopes(world) @ steps.mT

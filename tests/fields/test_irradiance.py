@@ -2,7 +2,7 @@
 
 import torch
 
-from monopart.fields.irradiance import NUM_IRRADIANCE, irradiance_basis
+from monopart.fields.irradiance import NUM_IRRADIANCE, ZONAL, irradiance_basis
 from monopart.geometry.rotations import axis_angle_to_rotmat
 
 DOUBLE = torch.float64
@@ -33,6 +33,16 @@ def test_a_turned_normal_stays_in_their_span() -> None:
     plain, turned = irradiance_basis(looks), irradiance_basis(looks @ turn.T)
     fitted = plain @ torch.linalg.lstsq(plain, turned).solution
     torch.testing.assert_close(fitted, turned, atol=1e-12, rtol=0)
+
+
+def test_turns_about_the_third_axis_leave_two_of_them_alone_and_cancel_the_others() -> None:
+    looks, angles = normals(50), torch.arange(12, dtype=DOUBLE) * torch.pi / 6
+    turns = axis_angle_to_rotmat(angles[:, None] * torch.tensor([0.0, 0, 1], dtype=DOUBLE))
+    turned = irradiance_basis(looks @ turns.mT)
+    expected = torch.zeros(50, NUM_IRRADIANCE, dtype=DOUBLE)
+    expected[:, ZONAL] = irradiance_basis(looks)[:, ZONAL]
+    torch.testing.assert_close(turned.mean(0), expected, atol=1e-12, rtol=0)
+    assert float((turned - turned[:1])[..., ZONAL].abs().max()) < 1e-12
 
 
 def test_shapes_derivatives_and_the_zero_normal() -> None:

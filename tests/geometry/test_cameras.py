@@ -65,6 +65,31 @@ def test_project_agrees_with_opencv(count, dtype, bound):
     torch.testing.assert_close(depth.to(F64), local[:, 2], rtol=0, atol=bound)
 
 
+def test_pixel_slopes_are_those_of_project():
+    camera = make_camera()
+    skewed = dataclasses.replace(
+        camera, K=camera.K + torch.tensor([[0.0, 7, 0], [0, 0, 0], [0] * 3])
+    )
+    points = points_near(40)
+    for one in (camera, skewed):
+        expected = torch.func.vmap(torch.func.jacrev(lambda p, c=one: c.project(p)[0]))(points)
+        torch.testing.assert_close(one.pixel_slopes(points), expected, rtol=1e-10, atol=1e-8)
+    assert torch.autograd.gradcheck(camera.pixel_slopes, points[:4].clone().requires_grad_())
+
+
+def test_pixel_slopes_before_the_nearest_depth_are_finite():
+    camera = Camera(torch.eye(3), torch.eye(3), torch.zeros(3), (4, 4))
+    points = torch.tensor([[0.0, 0.0, -1.0], [0.5, 0.0, 0.0]])
+    assert camera.pixel_slopes(points).isfinite().all()
+    at_one = torch.tensor([[1.0, 0, 0], [0, 1, 0]])
+    torch.testing.assert_close(camera.pixel_slopes(points[0], nearest=1.0), at_one)
+
+
+def test_pixel_slopes_of_a_lens_are_refused():
+    with pytest.raises(InputError, match="without_lens"):
+        make_camera(4).pixel_slopes(points_near(2))
+
+
 def test_legacy_pixels_move_centres_by_half():
     K = torch.tensor([[100.0, 0, 7], [0, 100, 5], [0, 0, 1]])
     camera = Camera.from_legacy_pixels(K, torch.eye(3), torch.zeros(3), (11, 15))

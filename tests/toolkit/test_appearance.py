@@ -21,6 +21,7 @@ from monopart.toolkit.captures import read_capture
 from monopart.toolkit.captures.doubts import heading_doubts
 from monopart.toolkit.checkpoint import load_weights, save_weights
 from monopart.toolkit.config import Config
+from monopart.toolkit.light import Light
 from monopart.toolkit.presets import preset, with_overrides
 from monopart.toolkit.render import render_view
 from monopart.toolkit.resume import load_state, save_state
@@ -149,16 +150,40 @@ def test_light_is_that_of_the_nearest_way_a_surface_was_seen_to_look(capture: Pa
     angle = torch.atan2(torch.full_like(facing, 0.2), facing.square().neg().add(1).sqrt())
     bent = angle.cos()[:, None] * rim + angle.sin()[:, None] * towards
     usual = torch.where(facing[:, None] > 0.2, normals, bent).float()
-    expected = irradiance_basis(usual @ camera.R.mT)[bodies.faces[face]].mean(1)
+    expected = irradiance_basis(usual @ light.axes.mT)[bodies.faces[face]].mean(1)
     facing = facing[bodies.faces[face]]
     known, away = (facing > -0.45).all(1), (facing < -0.95).all(1)
     bends = known & (facing < 0).all(1)
     assert all(bool(some.any()) for some in (bends, away, known & ~bends))
     torch.testing.assert_close(found[known], expected[known], atol=1e-5, rtol=1e-5)
-    assert float(found[away].abs().max()) == 0.0
+    steep = (normals.float() @ light.axes[2])[bodies.faces[face]]
+    around = torch.zeros(len(face), 8)  # what does not depend on the heading
+    around[:, 2], around[:, 7] = steep.mean(1), (3 * steep.square() - 1).mean(1)
+    torch.testing.assert_close(found[away], around[away], atol=1e-5, rtol=1e-5)
     code = torch.ones(len(face), 3)
     dark = light(bodies, torch.zeros(1), still, pairs, torch.arange(len(face)), code)
-    assert torch.equal(dark, torch.cat([code, torch.zeros(len(face), 8)], 1))
+    alone = found * torch.tensor([0.0, 0, 1, 0, 0, 0, 0, 1])
+    assert torch.equal(dark, torch.cat([code, alone], 1))
+
+
+def test_light_has_axes_that_stand_as_the_person_does(capture: Path) -> None:
+    record = read_capture(capture)
+    camera = record.cameras[record.split("train").cameras[0]]
+
+    def standing(turns: list[list[float]]) -> torch.Tensor:
+        frames = record.split("train").frames
+        poses = dict(record.poses)
+        for row, frame in enumerate(frames):
+            turn = torch.tensor(turns[row % len(turns)])
+            poses[frame] = dataclasses.replace(poses[frame], rotation=turn)
+        axes = Light.of(dataclasses.replace(record, poses=poses)).axes
+        torch.testing.assert_close(axes @ axes.mT, torch.eye(3), atol=1e-6, rtol=0)
+        return axes[2]
+
+    upright, headlong = [math.pi / 2, 0.0, 0.0], [-math.pi / 2, 0.0, 0.0]
+    torch.testing.assert_close(standing([upright]), torch.tensor([0.0, 0, 1]))
+    torch.testing.assert_close(standing([[0.0, 0, 0]]), torch.tensor([0.0, 1, 0]))
+    torch.testing.assert_close(standing([upright, headlong]), -camera.R[1])
 
 
 def test_a_step_leaves_out_the_light_of_some_frames(capture: Path) -> None:

@@ -21,7 +21,6 @@ from monopart.toolkit.pose_alignment import (
     _filled,
     _solve,
     align_poses,
-    aligned_size,
 )
 from monopart.toolkit.presets import preset, with_overrides
 from monopart.toolkit.refine import RefinedPoses
@@ -162,11 +161,6 @@ def test_depths_are_carried_over_the_edge_alone() -> None:
     depth, known = torch.zeros(1, 12), torch.zeros(1, 12, dtype=torch.bool)
     depth[0, :3], known[0, :3] = 2.0, True
     assert _filled(depth, known)[0].tolist() == pytest.approx([2.0] * 7 + [0.0] * 5)
-
-
-def test_pictures_are_never_enlarged() -> None:
-    assert aligned_size((48, 64), 256) == (48, 64)
-    assert aligned_size((1024, 512), 256) == (256, 128)
 
 
 def test_each_alignment_is_due_once() -> None:

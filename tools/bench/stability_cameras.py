@@ -129,6 +129,37 @@ def _project() -> Stress:
     )
 
 
+def _slopes() -> Stress:
+    """Slopes of the projection of a pinhole."""
+
+    def local(camera: Camera, points: np.ndarray) -> np.ndarray:
+        return np.stack([camera.R.numpy() @ p + camera.t.numpy() for p in points])
+
+    def exact(camera: Camera, points: np.ndarray) -> np.ndarray:
+        out = []
+        for x, y, depth in local(camera, points):
+            z = max(depth, MIN_DEPTH)
+            plane = np.array([[1.0, 0.0, -x / z], [0.0, 1.0, -y / z]]) / z
+            out.append(camera.K.numpy()[:2, :2] @ plane @ camera.R.numpy())
+        return np.stack(out).reshape(-1, 6)
+
+    def scale(camera: Camera, exact: np.ndarray, points: np.ndarray) -> np.ndarray:
+        z = np.maximum(local(camera, points)[:, 2], MIN_DEPTH)
+        largest = np.maximum(np.abs(points).max(1), np.abs(camera.t.numpy()).max())
+        return np.abs(exact).max(1) * np.maximum(largest / z, 1.0)
+
+    return Stress(
+        name="pixel_slopes",
+        title="slopes of the projection",
+        domain="any point; nearer than 1 µm or behind: as at 1 µm",
+        error="f·S/z²·(1 + r): an error of S, the largest coordinate, in the depth",
+        families=tuple(f for f in _project_families() if not f.extra.is_distorted),
+        ways=(Way("monopart", lambda cam, p: cam.pixel_slopes(p).flatten(1), True),),
+        exact=exact,
+        scale=scale,
+    )
+
+
 # --- rays --------------------------------------------------------------------------------------
 
 
@@ -312,5 +343,5 @@ def stresses() -> list[Stress]:
     from . import stability_paths, stability_pixels, stability_programs
 
     more = (stability_paths, stability_programs, stability_pixels)
-    own = [_project(), _rays(), _undistort(), _boxes()]
+    own = [_project(), _slopes(), _rays(), _undistort(), _boxes()]
     return [*own, *(stress for room in more for stress in room.stresses())]

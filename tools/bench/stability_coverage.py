@@ -71,6 +71,7 @@ COVERED: dict[str, str] = {
     # cameras, rays, boxes
     "Camera.look_at": "look_at",
     "Camera.project": "project",
+    "Camera.pixel_slopes": "pixel_slopes",
     "Camera.to_camera": "to_camera",
     "Camera.visible": "visible",
     "Camera.valid_pixels": "visible",
