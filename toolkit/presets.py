@@ -82,15 +82,20 @@ def _baselines() -> dict[str, Config]:
 
 def _presets() -> dict[str, Config]:
     fast = Config(preset="fast")
-    # Light says what a code of the frame would; residuals want an avatar to move.
+    # Light says what a code of the frame would; residuals want an avatar to move; the absolute error
+    # is sharper.
     best = Config(
         preset="best",
         deform=DeformConfig(start=0.6),
         appearance=AppearanceConfig(code=0),
-        loss=LossConfig(lpips=0.05),
+        loss=LossConfig(lpips=0.05, l1=0.25),
         train=TrainConfig(seconds=1680.0),
     )
-    tiny = Config(preset="tiny", train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0))
+    tiny = Config(
+        preset="tiny",
+        loss=best.loss,
+        train=TrainConfig(seconds=80.0, checkpoint_seconds=30.0),
+    )
     rigid = Config(preset="rigid", appearance=UNLIT, deform=DeformConfig(residual=False))
     full = Config(preset="full", appearance=dataclasses.replace(UNLIT, pose_feature=True))
     own = {"fast": fast, "best": best, "tiny": tiny, "rigid": rigid, "full": full}
