@@ -152,7 +152,7 @@ def test_the_distortion_grows_in_the_last_third(small_capture: Path) -> None:
 
 def test_colours_have_to_count(small_capture: Path) -> None:
     with pytest.raises(InputError, match=r"loss\.mse"):
-        make(small_capture, "loss.mse=0")
+        make(small_capture, "loss.mse=0", "loss.l1=0")
     trainer = make(small_capture, "loss.mse=0", "loss.l1=1")
     assert "psnr" not in trainer.step(0, 0.0)
 
