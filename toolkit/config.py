@@ -115,9 +115,9 @@ class AppearanceConfig:
     light: bool = True
     """The colour sees which way the surface below looks in the world: light stands still while the
     person turns."""
-    light_out: float = 0.0
-    """Share of training frames that a step lights as nobody saw them: such surfaces then have their
-    mean colour; at 0 the network goes on from those that were seen, which is closer."""
+    light_out: float = 0.1
+    """Share of training frames that a step lights as if nobody saw from which side: what surfaces
+    look like, in the mean, where nobody did."""
     leave_out: float = 0.5
     """Share of training poses that are blended from their neighbours, like an unseen pose."""
     blend_time: bool = False

@@ -82,13 +82,12 @@ def _baselines() -> dict[str, Config]:
 
 def _presets() -> dict[str, Config]:
     fast = Config(preset="fast")
-    # Light says what a code of the frame would; residuals want an avatar to move; the absolute error
-    # is sharper.
+    # Light says what a code of the frame would; residuals want an avatar to move.
     best = Config(
         preset="best",
         deform=DeformConfig(start=0.6),
         appearance=AppearanceConfig(code=0),
-        loss=LossConfig(lpips=0.05, l1=0.25),
+        loss=LossConfig(lpips=0.02, l1=0.1),
         train=TrainConfig(seconds=1680.0),
     )
     tiny = Config(
