@@ -46,7 +46,8 @@ class Light(torch.nn.Module):
         super().__init__()
         self._known: tuple[weakref.ref[PosedParts], Tensor] | None = None
         self.register_buffer("eyes", torch.stack([c.center for c in cameras]), persistent=False)
-        level = torch.linalg.cross(up, torch.eye(3).to(up)[int(up.abs().argmin())])
+        first = cameras[0].R.to(up)  # not of the world: a capture may be turned in it
+        level = torch.linalg.cross(up, first[int((first @ up).abs().argmin())])
         level = functional.normalize(level, dim=0)
         axes = torch.stack([level, torch.linalg.cross(up, level), up])
         self.register_buffer("axes", axes, persistent=False)

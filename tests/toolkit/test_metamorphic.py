@@ -120,7 +120,7 @@ def test_a_world_that_is_turned_and_moved(
 
 
 def test_a_lit_world_that_is_turned_and_moved(small_capture: Path, tmp_path: Path) -> None:
-    """Light is looked at from the first training camera, which is turned with the world."""
+    """Light has the axes of the person and of the first training camera, which turn with it."""
     base = make(small_capture, LIT)
     folder = restated(
         small_capture, tmp_path / "moved", variants.moved((0.4, 1.9, -0.8), (3, 1, 2))
