@@ -1,6 +1,6 @@
 """What an avatar makes of surfaces that look where no camera stood, asked on training pictures.
 
-    python tests/toolkit/hidden_half.py CAPTURE --set appearance.light_out=0
+    python tests/toolkit/hidden_half.py CAPTURE --settings appearance.light_out=0
 
 Trained on are frames 0 to 79 of the training camera, and of these the half of the person that looks
 to one side; the way there takes the place of the way to the camera in `toolkit.light`. Asked is the
