@@ -231,7 +231,19 @@ class PosedParts:
 
         Returns:
             Their means, weighted by the barycentrics; constants.
+
+        Raises:
+            InputError: a body or a face that is not there (not looked for on CUDA, where a look at
+                the values would wait).
         """
+        for name, index, end in (("body", body, len(values)), ("face", face, len(self.faces))):
+            if index.device.type == "cpu" and len(index):
+                low, high = (int(v) for v in index.aminmax())
+                if low < 0 or high >= end:
+                    raise InputError(
+                        f"{name}: expected indices in [0, {end - 1}], found {low} … {high}; pairs "
+                        "of points without a hit have none"
+                    )
         table = values.detach().flatten(0, 1)
         if table.dtype == torch.float32 and table.shape[1] % 4 == 0:
             from .kernels.closest import interpolate_rows

@@ -313,3 +313,6 @@ def test_values_of_vertices_are_mixed_on_faces(columns: int) -> None:
     double = parts.interpolate(values.double(), body, face, three[:, :2])
     torch.testing.assert_close(found, double.float(), atol=2e-6, rtol=1e-5)
     assert parts.interpolate(values, body[:0], face[:0], three[:0, :2]).shape == (0, columns)
+    for name, bad in (("body", (body + 2, face)), ("face", (body, face - len(parts.faces)))):
+        with pytest.raises(InputError, match=f"{name}: expected indices"):
+            parts.interpolate(values, *bad, three[:, :2])

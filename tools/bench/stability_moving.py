@@ -290,11 +290,15 @@ def _held_hit(points: Tensor) -> PartHit:
     return _canonical_parts().on_part(points.detach(), _part_of(points))
 
 
+def _some_faces(held: _Held, count: int) -> Tensor:
+    return torch.arange(count) * 97 % len(held.parts.faces)
+
+
 def _world_normals() -> Stress:
     """Normals of vertices on surface points, against sums over faces in float64."""
 
     def run(held: _Held, bary: Tensor) -> Tensor:
-        parts, face = held.parts, torch.arange(len(bary)) * 97
+        parts, face = held.parts, _some_faces(held, len(bary))
         normals = torch.nn.functional.pad(parts.world_normals(), (0, 1))
         return parts.interpolate(normals, torch.zeros_like(face), face, bary)[:, :3]
 
@@ -306,7 +310,7 @@ def _world_normals() -> Stress:
             np.add.at(total, faces[:, corner], np.cross(b - a, c - a))
         total /= np.linalg.norm(total, axis=1, keepdims=True)
         three = np.concatenate((bary, 1 - bary.sum(1, keepdims=True)), 1)
-        normal = np.einsum("mc,mci->mi", three, total[faces[np.arange(len(bary)) * 97]])
+        normal = np.einsum("mc,mci->mi", three, total[faces[_some_faces(held, len(bary)).numpy()]])
         return normal @ exact_rotmat(None, held.pose.rotation.double().numpy()[None])[0].T
 
     def places(generator: torch.Generator, count: int) -> Inputs:
