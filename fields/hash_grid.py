@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from monopart.geometry.errors import BackendError, InputError
+from monopart.geometry.index_checks import check_indices
 
 from .backend import Backend, choose_backend
 
@@ -191,12 +192,7 @@ class HashGrid(torch.nn.Module):
             if parts > 1:
                 raise InputError(f"HashGrid part: expected an index below {parts}, found None")
             return None
-        if part.device.type == "cpu" and part.numel() > 0:
-            low, high = (int(v) for v in part.aminmax())
-            if low < 0 or high >= parts:
-                raise InputError(
-                    f"HashGrid part: expected indices in [0, {parts - 1}], found {low} … {high}"
-                )
+        check_indices("HashGrid part", part, parts)
         return part
 
     def _forward_torch(self, points: Tensor, part: Tensor | None) -> Tensor:

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from monopart.geometry.errors import BackendError, InputError
+from monopart.geometry.index_checks import check_indices
 
 from .backend import Backend, choose_backend
 from .hash_grid import zeros_of
@@ -150,14 +151,8 @@ class PoseBank(torch.nn.Module):
                 f"PoseBank rows, weights: expected equal shapes [bodies, {parts}, 1 or more], "
                 f"found {tuple(rows.shape)} and {tuple(weights.shape)}"
             )
-        # on the CPU alone: a look at the values would wait for another device
-        for name, index, end in (("part", part, parts), ("rows", rows, poses)):
-            if index.device.type == "cpu" and index.numel() > 0:
-                low, high = (int(v) for v in index.aminmax())
-                if low < 0 or high >= end:
-                    raise InputError(
-                        f"PoseBank {name}: expected indices in [0, {end - 1}], found {low} … {high}"
-                    )
+        check_indices("PoseBank part", part, parts)
+        check_indices("PoseBank rows", rows, poses)
 
     def _forward_torch(
         self, place: Tensor, part: Tensor, owner: Tensor, rows: Tensor, weights: Tensor

@@ -17,6 +17,7 @@ from .body import BodyModel, PosedBody
 from .culling import BodyShell, ShellSamples
 from .errors import InputError
 from .face_tree import FaceTrees
+from .index_checks import check_indices
 from .parts import PartMap, rows_of_parts
 from .rigid import append_last_row, invert_affine, transform_points
 from .skinning import blend_transforms
@@ -237,13 +238,7 @@ class PosedParts:
                 the values would wait).
         """
         for name, index, end in (("body", body, len(values)), ("face", face, len(self.faces))):
-            if index.device.type == "cpu" and len(index):
-                low, high = (int(v) for v in index.aminmax())
-                if low < 0 or high >= end:
-                    raise InputError(
-                        f"{name}: expected indices in [0, {end - 1}], found {low} … {high}; pairs "
-                        "of points without a hit have none"
-                    )
+            check_indices(name, index, end, "; pairs of points without a hit have none")
         table = values.detach().flatten(0, 1)
         if table.dtype == torch.float32 and table.shape[1] % 4 == 0:
             from .kernels.closest import interpolate_rows

@@ -91,7 +91,8 @@ class Light(torch.nn.Module):
         """
         light = bodies.interpolate(self._table(bodies), body, pairs.face[rows], pairs.bary[rows])
         if lit is not None:
-            light = light * torch.lerp(self.around, torch.ones_like(self.around), lit[body, None])
+            shown = torch.lerp(self.around, torch.ones_like(self.around), lit[:, None])
+            light = light * shown[body]
         return light if code is None else torch.cat([code, light], -1)
 
     @torch.no_grad()

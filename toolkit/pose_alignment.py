@@ -147,8 +147,7 @@ def _slope(refined: RefinedPoses, shots: Shots, index: int) -> Slope:
     """The picture of one shot and its derivatives at the present pose of its frame."""
     row, body = shots.rows[index], refined.avatar.record.body
     largest = refined.avatar.config.refine.align_size
-    camera = shots.cameras[index].to(refined.given.pose)
-    camera = camera.resized(min(1.0, largest / max(camera.size)))
+    camera = _shrunk(shots.cameras[index].to(refined.given.pose), largest)
     batch = refined.poses(torch.tensor([row], device=refined.given.pose.device))
     pose = BodyPose(batch.pose[0], batch.betas[0], batch.rotation[0], batch.translation[0])
     view = View(camera=camera, pose=pose, frame=refined.frames[row])
@@ -171,6 +170,11 @@ def _slope(refined: RefinedPoses, shots: Shots, index: int) -> Slope:
     weighed = (off * trust[:, None]).flatten()
     error = float(weighed.square().sum())
     return Slope((rows.T @ rows).double(), (rows.T @ weighed).double(), error, len(weighed))
+
+
+def _shrunk(camera: Camera, largest: int) -> Camera:
+    """The camera of a picture that is no larger than a side."""
+    return camera.resized(min(1.0, largest / max(camera.size)))
 
 
 def _taken(shots: Shots, index: int, size: tuple[int, int]) -> Float[Tensor, "4 h w"]:

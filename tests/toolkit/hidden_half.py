@@ -26,6 +26,7 @@ from monopart.toolkit.arguments import resolve
 from monopart.toolkit.avatar import Avatar, view_of
 from monopart.toolkit.captures import Split, patches, read_capture
 from monopart.toolkit.captures.records import CaptureRecord
+from monopart.toolkit.part_picture import nearest_part
 from monopart.toolkit.render import render_view
 from monopart.toolkit.train import Trainer
 
@@ -49,7 +50,7 @@ def facing(record: CaptureRecord, frame: int, way: torch.Tensor) -> np.ndarray:
     camera = record.cameras[record.split("train").cameras[0]]
     with torch.no_grad():
         verts = record.body(record.poses[frame]).verts_world.reshape(-1, 3)
-    faces, (height, width) = record.body.faces, camera.size
+    faces = record.body.faces
     cosines = (vertex_normals(verts, faces) @ way).numpy()
     corners = faces.reshape(-1).numpy().astype(np.int32)
     points = wp.array(verts.numpy(), dtype=wp.vec3, device="cpu")
@@ -58,14 +59,10 @@ def facing(record: CaptureRecord, frame: int, way: torch.Tensor) -> np.ndarray:
     origins = rays.origins.expand_as(rays.directions)
     face, bary = shoot(mesh, origins.numpy(), rays.directions.numpy())
     hit = face >= 0
-    on = np.zeros(height * width, np.float32)
+    on = np.zeros(len(hit), np.float32)
     on[hit] = (bary[hit] * cosines[faces.numpy()[face[hit]]]).sum(1)
-    off = (~hit).reshape(height, width).astype(np.uint8)
-    pixel = cv2.DIST_LABEL_PIXEL
-    _, label = cv2.distanceTransformWithLabels(off, cv2.DIST_L2, 5, labelType=pixel)
-    known = np.zeros(label.max() + 1, np.float32)
-    known[label[off == 0]] = on.reshape(height, width)[off == 0]
-    return known[label]
+    pixel = np.where(hit, np.arange(len(hit)), -1).astype(np.int32)
+    return on[nearest_part(pixel.reshape(camera.size))[0]]
 
 
 def trained(record: CaptureRecord, settings: list[str], iterations: int, seed: int) -> Avatar:

@@ -11,6 +11,7 @@ from miniature import write_miniature
 from torch import Tensor
 
 from monopart.geometry.body import BodyPose
+from monopart.geometry.cameras import Camera
 from monopart.toolkit.alignment_schedule import align_when_due, passed
 from monopart.toolkit.avatar import Avatar, View
 from monopart.toolkit.captures import read_capture
@@ -19,6 +20,7 @@ from monopart.toolkit.corrections import PoseCorrections, frame_times
 from monopart.toolkit.pose_alignment import (
     Shots,
     _filled,
+    _shrunk,
     _solve,
     align_poses,
 )
@@ -161,6 +163,12 @@ def test_depths_are_carried_over_the_edge_alone() -> None:
     depth, known = torch.zeros(1, 12), torch.zeros(1, 12, dtype=torch.bool)
     depth[0, :3], known[0, :3] = 2.0, True
     assert _filled(depth, known)[0].tolist() == pytest.approx([2.0] * 7 + [0.0] * 5)
+
+
+def test_pictures_are_never_enlarged() -> None:
+    camera = Camera(torch.eye(3), torch.eye(3), torch.zeros(3), (48, 64))
+    assert _shrunk(camera, 256).size == (48, 64)
+    assert _shrunk(dataclasses.replace(camera, size=(1024, 512)), 256).size == (256, 128)
 
 
 def test_each_alignment_is_due_once() -> None:

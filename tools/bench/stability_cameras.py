@@ -33,10 +33,14 @@ def ahead(camera: Camera, depth: tuple[float, float], spread: float) -> Make:
 # --- oracles -----------------------------------------------------------------------------------
 
 
+def _local(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """World points in camera axes, one after the other."""
+    return np.stack([camera.R.numpy() @ p + camera.t.numpy() for p in points])
+
+
 def exact_pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
     """World to pixels; behind the camera the pixel of no answer."""
-    K, R, t = (x.numpy() for x in (camera.K, camera.R, camera.t))
-    local = np.stack([R @ p + t for p in points])
+    K, local = camera.K.numpy(), _local(camera, points)
     front = local[:, 2:] > MIN_DEPTH
     plane = np.where(front, local[:, :2], 0.0) / np.where(front, local[:, 2:], 1.0)
     pixels = exact_lens(camera, plane) @ K[:2, :2].T + K[:2, 2]
@@ -132,19 +136,16 @@ def _project() -> Stress:
 def _slopes() -> Stress:
     """Slopes of the projection of a pinhole."""
 
-    def local(camera: Camera, points: np.ndarray) -> np.ndarray:
-        return np.stack([camera.R.numpy() @ p + camera.t.numpy() for p in points])
-
     def exact(camera: Camera, points: np.ndarray) -> np.ndarray:
         out = []
-        for x, y, depth in local(camera, points):
+        for x, y, depth in _local(camera, points):
             z = max(depth, MIN_DEPTH)
             plane = np.array([[1.0, 0.0, -x / z], [0.0, 1.0, -y / z]]) / z
             out.append(camera.K.numpy()[:2, :2] @ plane @ camera.R.numpy())
         return np.stack(out).reshape(-1, 6)
 
     def scale(camera: Camera, exact: np.ndarray, points: np.ndarray) -> np.ndarray:
-        z = np.maximum(local(camera, points)[:, 2], MIN_DEPTH)
+        z = np.maximum(_local(camera, points)[:, 2], MIN_DEPTH)
         largest = np.maximum(np.abs(points).max(1), np.abs(camera.t.numpy()).max())
         return np.abs(exact).max(1) * np.maximum(largest / z, 1.0)
 
